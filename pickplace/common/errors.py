@@ -50,7 +50,7 @@ MAX_LENGTH, MAX_WORD = 1_000, 300
 #: A word in the name of a key.
 WORD = re.compile("[^\\W_]+")
 
-#: What an error of the operating system asks for; others ask for another path.
+#: The remedies for some errors of the operating system; for the others it is another path.
 REMEDIES = {
     **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "a place where you may read and write"),
     **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "free space"),
@@ -64,11 +64,11 @@ def one_sentence():
     A command that a signal ended has the exit code 128 + its number: 130 after Ctrl-C, 143 after SIGTERM.
     """
     before = os.environ.get("HYDRA_FULL_ERROR", "0")
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # let Hydra raise errors, which it would print over many lines
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # let Hydra raise errors instead of printing them over many lines
     try:
         yield
         write_output()
-    except KeyboardInterrupt as stop:  # its argument is the signal, of a training that saved before
+    except KeyboardInterrupt as stop:  # a training that saved before gives the signal
         sys.exit(128 + (stop.args[0] if stop.args else signal.SIGINT))
     except BrokenPipeError:  # the reader of the output, such as head, has closed it
         sys.exit(141)
@@ -85,7 +85,7 @@ def one_sentence():
 
 
 def write_output(text: str = "") -> None:
-    """Write to standard output, now.
+    """Write to standard output and flush it.
 
     Raises:
         OSError: if that fails. The output is dropped then: the interpreter would try again, and print a traceback.
@@ -100,7 +100,7 @@ def write_output(text: str = "") -> None:
 
 
 def sentence(error: Exception) -> str:
-    """Return an error as one line of at most :data:`MAX_LENGTH` letters, without those that control a terminal."""
+    """Return an error as one line of at most :data:`MAX_LENGTH` letters, without control characters."""
     text = "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in _sentence(error))
     text = re.sub(r"; use sys\.set_int_max_str_digits\(\) to increase the limit", "", text)
     text = re.sub(rf"\S{{{MAX_WORD},}}", lambda word: f"{word[0][:80]}...{word[0][-30:]}", text)
@@ -121,20 +121,20 @@ def _sentence(error: Exception) -> str:
 
 
 def needs_extra(group: str, extra: str) -> AbstractContextManager:
-    """Name the optional extra of an option of a config group, if an import in the block fails."""
+    """Raise an error that names the optional extra of a config group's option, if an import in the block fails."""
     return reworded(
         ImportError, lambda _: ValueError(f"{group}={extra}: {extra} is missing; pip install 'pickplace[{extra}]'.")
     )
 
 
 def unknown_key(key: str, node: DictConfig | dict, prefix: str = "", others: Collection[str] = ()) -> str:
-    """Return a sentence on a key that is not in a config, with the keys that are.
+    """Return a sentence on a key that is not in a config; it lists the keys that are.
 
     Args:
         key: the whole key, such as ``algo.gama``.
         node: the config, or the part of it at ``prefix``.
         prefix: place of the part, with a dot at its end.
-        others: whole names, of keys and groups, one of which may be meant.
+        others: full names of keys and groups that may be meant.
     """
     *parents, leaf = key.removeprefix(prefix).split(".")
     for parent in parents:
@@ -153,9 +153,9 @@ def unknown_key(key: str, node: DictConfig | dict, prefix: str = "", others: Col
 
 
 def full_names(key: str, names: Collection[str]) -> list[str]:
-    """Return the names of keys and groups that a misspelt name may mean, or one without its beginning; at most four.
+    """Return up to four names of keys and groups that may be meant by a name that is misspelt or lacks its beginning.
 
-    ``rotations`` and ``env.rotation`` mean ``env.rotations``, and ``frames`` any name that ends so.
+    ``rotations`` and ``env.rotation`` mean ``env.rotations``, and ``frames`` any name that ends in it.
     """
     endings = defaultdict(list)
     for name in names:

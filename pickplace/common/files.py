@@ -1,4 +1,4 @@
-"""Files that a user or a stranger's run folder names: how they are read, and how they are replaced as a whole."""
+"""Reading of files that a user or a run folder of unknown origin names, and replacement of files as a whole."""
 
 import csv
 import io
@@ -40,7 +40,7 @@ def read_file(path, most: int = MAX_BYTES, links: bool = True, empty: bool = Tru
 
 
 def read_text(path, most: int = MAX_BYTES, encoding: str = "utf-8", empty: bool = True) -> str:
-    """Return the text of a regular file; arguments and errors as of :func:`read_file`."""
+    """Return the text of a regular file; for arguments and errors see :func:`read_file`."""
     with reworded(
         UnicodeDecodeError, lambda error: ValueError(f"{path}, {_bad_byte(error)}; expected a text in UTF-8.")
     ):
@@ -54,7 +54,7 @@ def _bad_byte(error: UnicodeDecodeError) -> str:
 
 
 def read_table(key: str, path, *headers: str) -> tuple[str, list[tuple[int, list[str]]]]:
-    """Return the header of a CSV file, and the other rows: the number of the line and the fields, without white space.
+    """Return the header of a CSV file, and for each other row its line number and its fields, without white space.
 
     Args:
         key: the setting that names the file.
@@ -62,7 +62,7 @@ def read_table(key: str, path, *headers: str) -> tuple[str, list[tuple[int, list
         headers: the headers that it may have, with commas.
 
     Raises:
-        ValueError: naming the file, for one that is not there, has another header, or no row below it.
+        ValueError: naming the file, if it does not exist, has another header, or has no row below it.
     """
     refuse_if(
         not Path(path).exists(),
@@ -85,7 +85,7 @@ def replaced_file(path):
     """Yield the path of a new file beside ``path``, which replaces it when the block ends.
 
     If the block fails, the old file stays as it was and nothing of the new one is left. An old file that is a link is
-    replaced, and not written through. When the function returns, the disk has the new file under its name: a power
+    replaced; its target is not written. When the function returns, the disk has the new file under its name: a power
     failure after that does not bring the old one back.
 
     Raises:
@@ -95,7 +95,7 @@ def replaced_file(path):
     new = path.with_name(f".{path.stem}.new{path.suffix}")
     with reworded(OSError, lambda error: OSError(error.errno, error.strerror or str(error), str(path))):
         try:
-            new.unlink(missing_ok=True)  # a link, perhaps
+            new.unlink(missing_ok=True)  # it may be a link
             yield new
             with new.open("rb") as file:
                 os.fsync(file.fileno())
@@ -106,9 +106,9 @@ def replaced_file(path):
 
 
 def sync_folder(folder) -> None:
-    """Write the names in a folder to the disk: a rename is there after a power failure only if its folder is.
+    """Write the names in a folder to the disk: only then does a rename survive a power failure.
 
-    File systems that cannot do it for a folder, such as some in a network, are left alone.
+    Nothing is done on file systems that cannot do it for a folder, such as some in a network.
     """
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)

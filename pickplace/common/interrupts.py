@@ -1,4 +1,4 @@
-"""Ctrl-C while modules are imported, which takes seconds: libraries in C may not survive an exception then."""
+"""Handling of Ctrl-C during imports, which take seconds: libraries in C may not survive an exception then."""
 
 import os
 import signal
@@ -7,7 +7,7 @@ from types import ModuleType
 
 
 def import_quietly(name: str) -> ModuleType:
-    """Import a module; Ctrl-C meanwhile ends the process, without a word."""
+    """Import a module; Ctrl-C meanwhile ends the process without a message."""
     before = on_interrupt(end_process)
     try:
         return import_module(name)

@@ -33,7 +33,7 @@ def use_threads(key: str, threads: int | None) -> None:
 
 
 def keep_memory() -> None:
-    """Let glibc keep memory that is freed. To return it at each step and to get it again took a fifth of a training."""
+    """Let glibc keep freed memory: returning it at each step and getting it again took a fifth of a training."""
     most, m_trim_threshold, m_mmap_max = 2**31 - 1, -1, -4  # of <malloc.h>
     if sys.platform == "linux":
         with suppress(OSError, AttributeError):  # another C library

@@ -11,7 +11,7 @@ from typing import Any
 #: Greatest count that the program's tensors and files hold.
 MAX_COUNT = 2**63 - 1
 
-#: Gigabytes that one batch may take on a CPU, unless the environment variable of that name says otherwise.
+#: The environment variable that limits the memory of one batch, and the limit on a CPU without it, in gigabytes.
 MEMORY_VARIABLE, CPU_GIGABYTES = "PICKPLACE_MEMORY_GB", 0.8
 
 #: Greatest width of a layer, and greatest number of inputs of a neuron.
@@ -19,7 +19,7 @@ MAX_WIDTH, MAX_INPUTS = 1_024, 8_192
 
 
 class _Repr(Repr):
-    """Without addresses of objects."""
+    """Representations of values without addresses of objects."""
 
     def repr_instance(self, x, level):
         has_address = type(x).__repr__ is object.__repr__  # type: ignore[comparison-overlap]
@@ -37,7 +37,7 @@ def excerpt(value) -> str:
 
 
 def short_text(name) -> str:
-    """Return a name for a message, as :func:`excerpt` but without quotes."""
+    """Return a name for a message, like :func:`excerpt` but without quotes."""
     return excerpt(str(name))[1:-1]
 
 
@@ -47,26 +47,26 @@ def first_line(error: Exception) -> str:
 
 
 def expect(good: Any, key: str, value: Any, expected: str) -> Any:
-    """Return a value that is good, or refuse it; the message says what was expected."""
+    """Return ``value`` if ``good``, else raise a ``ValueError`` that says what was expected."""
     if not good:
         raise ValueError(f"{key}={excerpt(value)}: expected {expected}.")
     return value
 
 
 def refuse_if(bad: Any, message: str, error: type[Exception] = ValueError) -> None:
-    """Raise an error with a message if something is bad."""
+    """Raise an error with a message if ``bad``."""
     if bad:
         raise error(message)
 
 
 def refuse_any(found: Iterable, message: Callable[[Any], str], error: type[Exception] = ValueError) -> None:
-    """Raise an error about the first of the things found, if there is any."""
+    """Raise an error about the first element of ``found``, if there is any."""
     for first in found:
         raise error(message(first))
 
 
 def without_twins(pairs: list[tuple[str, Any]]) -> dict:
-    """Return an object of a JSON text; refuse a key that stands twice in it: readers differ in which value counts."""
+    """Return an object of a JSON text; refuse a repeated key, as readers differ in which value counts."""
     found: dict = {}
     for key, value in pairs:
         refuse_if(key in found, f"{excerpt(key)} stands twice in an object; expected each key once.")
@@ -112,7 +112,7 @@ def whole_numbers(place: str, most: int, **values) -> None:
 
 
 def integral_number(key: str, value, least: int = 1, most: int = MAX_COUNT) -> int:
-    """Return ``value`` as an int, as :func:`whole_number`; a float such as 5e6 is accepted."""
+    """Return ``value`` as an int, like :func:`whole_number`; a float such as 5e6 is accepted."""
     return whole_number(key, int(value) if isinstance(value, float) and value.is_integer() else value, least, most)
 
 
@@ -168,7 +168,7 @@ def number_or_null(key: str, value, least: float, most: float) -> float | None:
 
 
 def or_null(check: Callable[..., Any], key: str, value, *limits) -> Any:
-    """Return None for None, and what a validator returns for any other value."""
+    """Return None for None, and the result of a validator for any other value."""
     return None if value is None else check(key, value, *limits)
 
 
@@ -185,9 +185,9 @@ def check_bytes(setting: str, needed: int, device="cpu") -> None:
     Args:
         setting: the keys and their values, for the message.
         needed: bytes that they would take.
-        device: where the tensors would be.
+        device: device of the tensors.
     """
-    import torch  # not before it is needed: errors are worded without it
+    import torch  # only when needed: the other checks work without it
 
     device, given = torch.device(device), os.environ.get(MEMORY_VARIABLE)
     most = torch.cuda.get_device_properties(device).total_memory / 2e9 if device.type == "cuda" else CPU_GIGABYTES

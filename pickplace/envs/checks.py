@@ -20,7 +20,7 @@ MAX_POSITIONS = 2_000_000  # of items in the bin, all kinds together, that are c
 
 
 def problem_bytes(cell: CellSpec, masks: Collection[str]) -> int:
-    """Return about how many bytes the masks of one problem, and what they are found with, take."""
+    """Return about the number of bytes of one problem's masks and of the tensors from which they are computed."""
     offsets = cell.num_offsets**2
     count = 64 * cell.num_footprints + 32 * cell.rotations * (offsets + cell.num_picks)
     count += cell.handling * (16 * cell.num_footprints + 10 * cell.pile_room**2)
@@ -28,15 +28,16 @@ def problem_bytes(cell: CellSpec, masks: Collection[str]) -> int:
 
 
 def most_items(cell: CellSpec, items: ItemDistribution) -> int:
-    """Return how many items a tote holds at most: as many as have room by their volume, or come in an episode."""
+    """Return the greatest number of items in a tote: as many as have room by volume, or come in an episode."""
     by_volume = cell.tote_volume(cell.tote_size[2]) // int(items.sizes.prod(1).min())
     return max(1, min(by_volume, items.longest_episode or by_volume))
 
 
 def _corners(cell: CellSpec, items: ItemDistribution, kind: int) -> Iterable[tuple[int, int]]:
-    """Return the positions of a kind in the bin that are checked: of those that are alike one.
+    """Return the positions of a kind in the bin to check: one for all positions that are equivalent.
 
-    Without limits all are alike that the end effector's size parts from a wall, if the kind may lie anywhere.
+    Without limits, positions are equivalent if the end effector's size fits between item and wall, and the kind may lie
+    anywhere.
     """
     if cell.limits is not None or type(items).corners is not ItemDistribution.corners:
         return items.corners(kind, cell.bin_size)
@@ -54,14 +55,14 @@ def check_items(cell: CellSpec, items: ItemDistribution, mix: int = 0, turns: in
     Args:
         cell: the sizes.
         items: the item distribution.
-        mix: which of its mixes.
-        turns: bit mask of the rotations that are allowed.
+        mix: number of one of its mixes.
+        turns: bit mask of the allowed rotations.
 
     Raises:
         ValueError: naming the kind, the position and the tote height.
     """
     (w_b, d_b, _), height = cell.bin_size, cell.tote_size[2]
-    # (x, y, w, d, h, turns) -> the first kind like it: the rows of a long recording repeat themselves
+    # (x, y, w, d, h, turns) -> the first such kind: the rows of a long recording repeat themselves
     problems: dict[tuple[int, ...], int] = {}
     widest: dict[str, tuple[int, ...]] = {"bin_size": (w_b, d_b)}
     if largest := cell.gripper.largest_item:
@@ -85,7 +86,7 @@ def check_items(cell: CellSpec, items: ItemDistribution, mix: int = 0, turns: in
     cell = replace(cell, longest_side=longest_side(cell, items))
     rows = torch.tensor([(*item, kind) for item, kind in problems.items()])
     if cell.limits is None:
-        # The lower an item, the harder to clear the rim; and what is far from all walls of the tote is alike.
+        # The lowest item of a size decides: it clears the rim least. Places far from the tote's walls are equivalent.
         rows = rows[rows[:, 4].argsort(stable=True)]
         enough = 2 * (max(cell.gripper.size) + cell.max_side)
         cell = replace(cell, tote_size=(min(cell.tote_size[0], enough), min(cell.tote_size[1], enough), height))
@@ -112,7 +113,7 @@ def check_items(cell: CellSpec, items: ItemDistribution, mix: int = 0, turns: in
 
 
 def check_numbers(key: str, values: torch.Tensor, low: int, high: int, expected: str) -> torch.Tensor:
-    """Return whole numbers in ``[low, high]`` as int64; ``ValueError`` for others."""
+    """Return whole numbers in ``[low, high]`` as int64; raise ``ValueError`` for others."""
     if not torch.can_cast(values.dtype, torch.int64):
         raise ValueError(f"{key}={values[0].item()} ({values.dtype}): expected whole numbers, as integers.")
     if (bad := (values < low) | (values > high)).any():

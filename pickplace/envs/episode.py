@@ -1,8 +1,8 @@
-"""Episode settings: what episodes of one environment may differ in, beside the height of the tote.
+"""Episode settings, in which episodes of one environment may differ besides the height of the tote.
 
 Each is a whole number for each problem. A curriculum, or ``options`` of Gymnasium, gives it with a reset; an episode
-keeps it to its end. Settings that are not given are as in the full task. A rollout of TorchRL that resets itself hands
-over the entries of the episode that ended, so that the next one has the same settings.
+keeps it to its end. Settings that are not given are those of the full task. A TorchRL rollout that resets itself passes
+on the entries of the episode that ended, so that the next one has the same settings.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,7 +27,7 @@ class Setting(NamedTuple):
         limits: ``limits(cell, items)``, the least and the greatest number.
         read: ``read(key, value, cell)``, the number that stands for a value in a config; ``ValueError`` for a bad one.
         encode: from an entry of an observation, ``[N, ...]``, to numbers, int64 ``[N]``.
-        decode: ``decode(numbers, cell)``, the other way.
+        decode: ``decode(numbers, cell)``, the inverse of ``encode``.
     """
 
     field: str
@@ -51,7 +51,7 @@ def _read_rotations(key: str, value: Any, cell: CellSpec) -> int:
 
 
 def _read_up_to(most: Callable[[CellSpec], int], origin: str, least: int = 1) -> Callable[[str, Any, CellSpec], int]:
-    """Return a function that reads a number between a least one and one that the environment sets."""
+    """Return a function that reads a whole number from ``least`` to a limit of the cell."""
 
     def read(key: str, value: Any, cell: CellSpec) -> int:
         with reworded(ValueError, lambda error: ValueError(f"{str(error).rstrip('.')}, {origin}.")):
@@ -88,7 +88,7 @@ SETTINGS: dict[str, Setting] = {
     ),
 }  # fmt: skip
 
-#: What a reset may be given: the height of the tote, in which episodes may always differ, and the settings.
+#: The entries that a reset accepts: the height of the tote, in which episodes may always differ, and the settings.
 RESET_ENTRIES: dict[str, Setting] = {
     "tote_height": Setting(
         "tote_height", lambda cell: cell.tote_size[2],

@@ -24,14 +24,14 @@ INFO = ("occupancy", "failure", "action_mask")
 class PickPlaceGymEnv(gymnasium.Env):
     """
     ## Description
-    A suction robot takes items one by one from a bin and packs them into a tote. Where it grips an item decides where
-    it can set it down: the end effector must hit neither the tote's walls nor what is already inside. Pick cell, place
-    cell and rotation are one action. See *Simultaneous Planning for Item Picking and Placing by Deep Reinforcement
+    A suction robot takes items one by one from a bin and packs them into a tote. The grip decides where an item can be
+    set down: the end effector must hit neither the tote's walls nor the items inside. Pick cell, place cell and
+    rotation are one action. See *Simultaneous Planning for Item Picking and Placing by Deep Reinforcement
     Learning* (Tanaka et al., IROS 2020).
 
     ## Action Space
     `Discrete(N_a)`: the flat index `(((x_B * D_B + y_B) * W_T + x_T) * D_T + y_T) * R + r` of pick cell, place cell and
-    rotation. Most actions fail; `action_masks()` tells which would succeed.
+    rotation. Most actions fail; `action_masks()` marks those that would succeed.
 
     ## Observation Space
     A `Dict`:
@@ -51,8 +51,8 @@ class PickPlaceGymEnv(gymnasium.Env):
     | `items` | `(M, 5)` int64 | x, y, w, d, h of each item in the bin; zeros: none |
 
     with `preview=p` `coming`, `(p, 5)` int64: x, y, w, d, h of the items that arrive next, in their order; zeros: none;
-    with `handling=True` the items' `handling`, and what lies on what: `tote_labels`, `pile_spare` and `pile_below`;
-    and what `observation=` adds (see `PickPlaceEnv`).
+    with `handling=True` the items' `handling`, and the pile in the tote: `tote_labels`, `pile_spare` and `pile_below`;
+    and the terms of `observation=` (see `PickPlaceEnv`).
 
     ## Rewards
     The volume placed, in cells times height units; 0 for an action that fails. An episode's return is the volume
@@ -60,18 +60,18 @@ class PickPlaceGymEnv(gymnasium.Env):
 
     ## Starting State
     An empty tote, and a bin with the first item of an episode. `reset(seed=s)` begins the item stream `s`; later resets
-    without a seed go on to its next episode. `options={"tote_height": h}` sets the height of this episode's tote; with
-    `varies=("rotations", ...)` an option sets each of these, too: `rotations` (a number, or a list of those that are
-    allowed), `bin_items`, `refill`, `preview`, `item_mix` (a number, see `ItemDistribution.mixed`)
+    without a seed play its next episodes. `options={"tote_height": h}` sets the height of this episode's tote. With
+    `varies=("rotations", ...)` there is an option for each of these, too: `rotations` (a number, or a list of the
+    allowed ones), `bin_items`, `refill`, `preview`, `item_mix` (a number, see `ItemDistribution.mixed`)
     and `level`.
 
     ## Episode End
-    Termination: the action fails, or nothing can be done with any item in the bin. Truncation: the item stream has
-    ended; nothing more comes then, so a learner that continues truncated episodes by a value had better take 0.
+    Termination: the action fails, or no action is feasible with any item in the bin. Truncation: the item stream has
+    ended. No item follows, so a learner that bootstraps truncated episodes should use a value of 0.
 
     ## Information
     `occupancy`: share of the tote's volume that is filled; `failure`: why the action or the episode failed (`"none"`,
-    `"pick_miss"`, ..., `"stuck"`); `action_mask`: as `action_masks()`.
+    `"pick_miss"`, ..., `"stuck"`); `action_mask`: the same as `action_masks()`.
 
     ## Arguments
     `items`: an item distribution, or a list of `(w, d, h)`; by default the paper's four kinds. The settings of
@@ -102,7 +102,7 @@ class PickPlaceGymEnv(gymnasium.Env):
         return _first(observations, self._env.terms), *(part[0].item() for part in results), _first(infos, INFO)
 
     def action_masks(self) -> np.ndarray:
-        """Return which actions would succeed, bool ``[N_a]``; sb3-contrib's MaskablePPO looks for this name."""
+        """Return a mask of the actions that would succeed, bool ``[N_a]``; sb3-contrib's MaskablePPO calls it."""
         return self._vector.action_masks()[0]
 
 
@@ -111,19 +111,19 @@ def _first(arrays: dict[str, np.ndarray], keys: Iterable[str]) -> dict[str, Any]
 
 
 class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
-    """Many problems at once, as tensors: what ``gymnasium.make_vec("pickplace/PickPlace-v0", num_envs=N)`` makes.
+    """Many problems at once, as tensors; made by ``gymnasium.make_vec("pickplace/PickPlace-v0", num_envs=N)``.
 
     Spaces, rewards and information are those of :class:`PickPlaceGymEnv`. ``reset(seed=s)`` begins the item stream
     ``s``: slot ``i`` plays its episodes ``i``, ``i + N``, ``i + 2 N``, ... ``options``: ``tote_height`` (a number, or
     one for each slot), other settings of the episodes (one value, or a list with one for each slot), and ``reset_mask``
-    (bool ``[N]``, the slots to reset). A plain list of ``rotations`` is one value, those that every slot allows; with
-    one for each slot it is a list of lists. What resets itself plays the full task.
+    (bool ``[N]``, the slots to reset). A plain list of ``rotations`` is one value, for all slots; values for each slot
+    are a list of lists. A slot that resets itself plays the full task.
 
     Args:
         num_envs: ``N``.
         items: an item distribution, or a list of ``(w, d, h)``.
         autoreset_mode: Gymnasium's ``"NextStep"`` (the default), ``"SameStep"`` or ``"Disabled"``.
-        **settings: as of :class:`PickPlaceGymEnv`; there is no rendering.
+        **settings: see :class:`PickPlaceGymEnv`; there is no rendering.
     """
 
     single_action_space: spaces.Discrete
@@ -218,9 +218,9 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         return self._observations(state), reward, terminated, truncated, infos
 
     def action_masks(self) -> np.ndarray:
-        """Return which actions would succeed, bool ``[N, N_a]``.
+        """Return a mask of the actions that would succeed, bool ``[N, N_a]``.
 
-        In a slot that resets itself in the next step, action 0 alone: ignored, but a learner that masks needs one.
+        A slot that resets itself in the next step has only action 0. It is ignored, but a masking learner needs one.
         """
         return self._permitted(self._env.action_mask)
 
@@ -231,7 +231,7 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         return masks
 
     def _entry(self, key: str, given: Any) -> torch.Tensor:
-        """Return an option as the entry of an observation, ``[N, ...]``: a value, or one for each problem in a list."""
+        """Return an option, a value or a list of one for each problem, as an entry of an observation, ``[N, ...]``."""
         setting, place, cell = RESET_ENTRIES[key], f"options[{key!r}]", self._env.cell
         given = given.tolist() if isinstance(given, np.ndarray) else given
         try:
@@ -250,7 +250,7 @@ class PickPlaceVectorEnv(gymnasium.vector.VectorEnv):
         return {key: state[key].cpu().numpy().copy() for key in self._env.terms}
 
     def _infos(self, state, rows: np.ndarray) -> dict[str, Any]:
-        """Return Gymnasium's convention: an array for each key, and a mask ``_key`` of the slots that have it."""
+        """Return infos in Gymnasium's form: an array for each key, and a mask ``_key`` of the slots that have it."""
         names = np.array([failure.name.lower() for failure in Failure], dtype=object)
         infos = {
             "occupancy": state["occupancy"][:, 0].double().cpu().numpy().copy(),

@@ -20,11 +20,11 @@ from pickplace.runs.locate import CheckpointError
 
 
 def check_saved_states(env: PickPlaceEnv, collector: Mapping) -> None:
-    """Refuse a collector's state with an environment whose values are out of range, or do not fit each other.
+    """Refuse a collector's state if values of its environment are out of range or inconsistent.
 
     Args:
         env: an environment of the same settings, with any number of problems.
-        collector: the saved ``state_dict()``, or that of each worker by its name.
+        collector: the saved ``state_dict()``, or one for each worker by its name.
 
     Raises:
         CheckpointError: naming the first value that is impossible.
@@ -38,9 +38,10 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
     """Check one environment.
 
     Args:
-        env, saved: as of :func:`check_saved_states`; the ``state_dict()`` of the saved one.
-        carried: the observation that its next step starts from. A term of the user's own may draw, so that only
-            pickplace's are compared.
+        env: see :func:`check_saved_states`.
+        saved: the ``state_dict()`` of the saved environment.
+        carried: the observation from which its next step starts. A user's term may be random, so that only the terms of
+            pickplace are compared.
     """
 
     def check(key: str, possible: Tensor, expected: str) -> None:
@@ -91,12 +92,12 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
     seen["occupancy"] = (volume / cell.tote_volume(tote_height))[:, None]
     seen |= {key: torch.zeros(len(steps), 1) for key in ("failure", "done", "terminated", "truncated")}
     for key, value in seen.items():
-        close = (carried[key].double() - value.double()).abs() < 1e-4  # another device rounds in another way
+        close = (carried[key].double() - value.double()).abs() < 1e-4  # devices round differently
         check(f"the carried {key}", close, "what the state shows")
 
 
 def _is_possible(pile: Pile, steps: Tensor, heights: Tensor) -> Tensor:
-    """Return whether piles can be those of totes in which ``steps`` items lie, bool ``[N]``.
+    """Return whether piles are possible in totes with ``steps`` items, bool ``[N]``.
 
     Args:
         steps: int64 ``[N]``.
@@ -106,12 +107,12 @@ def _is_possible(pile: Pile, steps: Tensor, heights: Tensor) -> Tensor:
     there = torch.arange(spare.shape[1]) < steps[:, None]
     within = there[:, :, None] & there[:, None]
     earlier = within.tril(-1) | within & torch.eye(spare.shape[1], dtype=torch.bool)
-    through = (below.float() @ below.float()) > 0  # below what is below
+    through = (below.float() @ below.float()) > 0  # below an item that is below
     good = (below.diagonal(dim1=1, dim2=2) == there).all(1) & ~(below & ~earlier).flatten(1).any(1)
     good &= (through == below).flatten(1).all(1)
     good &= ((spare >= 0) & (spare <= NO_LIMIT) & (there | (spare == 0))).all(1)
     seen = (labels >= 0) & (labels <= steps[:, None, None]) & ((labels > 0) == (heights > 0))
-    # The cells on which one item is seen are level.
+    # All cells with the same item on top are level.
     number = labels.flatten(1)
     tops = torch.zeros(len(labels), spare.shape[1] + 1, dtype=heights.dtype)
     tops.scatter_(1, number.clamp(0, spare.shape[1]), heights.flatten(1))

@@ -65,27 +65,27 @@ class PickPlaceEnv(EnvBase):
         * with ``handling``: ``handling``, int64 ``[N, M, 3]``, the turns that each item allows (bit ``r`` for rotation
           ``r``), its mass, and the greatest load on it, grams; and the pile in the tote of up to ``L`` items:
           ``tote_labels``, int64 ``[N, W_T, D_T]``, number of the item on each cell, from 1, 0 for the floor;
-          ``pile_spare``, int64 ``[N, L]``, the mass that each still bears; ``pile_below``, bool ``[N, L, L]``, which
-          items lie below each, itself included.
+          ``pile_spare``, int64 ``[N, L]``, the mass that each still bears; ``pile_below``, bool ``[N, L, L]``, whether
+          the second item lies below the first, or is the same.
         * with ``varies``: ``rotations``, bool ``[N, R]``; int64 ``[N, 1]``: ``item_mix``, ``bin_items``, ``refill``,
           ``preview`` and ``level``.
         * further terms, see ``observation``.
-        * ``action_mask``, bool ``[N, N_a]``: True where and only where the action would succeed.
-        * ``footprint_mask``, bool ``[N, M * Q * W_T * D_T]``, only with ``masks`` naming it: the distinct
-          ``(item, parity, x, y)`` that some action reaches; ``corner_mask``, the same of those that occupy a corner.
+        * ``action_mask``, bool ``[N, N_a]``: True exactly where the action would succeed.
+        * ``footprint_mask``, bool ``[N, M * Q * W_T * D_T]``, only if ``masks`` names it: the distinct
+          ``(item, parity, x, y)`` that some action reaches; ``corner_mask`` likewise: those of them in corners.
         * ``occupancy``, float32 ``[N, 1]``: volume placed / volume of the tote.
 
     Rewards:
         The volume placed, in cells times height units, float32 ``[N, 1]``; 0 for a failed action.
 
     Starting state:
-        An empty tote of the height given as ``tote_height`` (int64 ``[N, 1]``) in the TensorDict handed to ``reset``,
-        by default ``tote_size[2]``; with the settings of :data:`~pickplace.envs.episode.SETTINGS` that are given
-        there, if ``varies`` names them, else with those of the full task. And a bin with the episode's first items: as
-        many of ``bin_items`` as have room, or the first alone if nothing is feasible then.
+        An empty tote. Its height is ``tote_height`` (int64 ``[N, 1]``) of the TensorDict given to ``reset``, by default
+        ``tote_size[2]``. The settings named by ``varies`` may be given there, too, see
+        :data:`~pickplace.envs.episode.SETTINGS`; by default they are those of the full task. The bin has the episode's
+        first items: up to ``bin_items``, as far as they have room, or only the first if nothing is feasible then.
 
     Episode end:
-        ``terminated`` after a failed action, or when nothing can be done with any item in the bin (``stuck``);
+        ``terminated`` after a failed action, or if no action is feasible with any item in the bin (``stuck``);
         ``truncated`` when the item stream has ended. ``failure``, int64 ``[N, 1]``, is a :class:`Failure`.
 
     Args:
@@ -93,14 +93,14 @@ class PickPlaceEnv(EnvBase):
             paper's four kinds.
         num_envs: ``N``.
         seed: seed of the item stream.
-        device: where the tensors live.
-        stream: family of item streams, ``"train"``, ``"validation"`` or ``"test"``; they never meet.
-        masks: which masks to emit, any of ``"action"``, ``"footprint"`` and ``"corner"``.
-        observation: what the agent sees, :class:`~pickplace.rules.observation.Term` by key; by default the four
-            terms above, which are always among them.
+        device: device of the tensors.
+        stream: family of item streams, ``"train"``, ``"validation"`` or ``"test"``; these share no episodes.
+        masks: the masks to emit, any of ``"action"``, ``"footprint"`` and ``"corner"``.
+        observation: entries of the observation, :class:`~pickplace.rules.observation.Term` by key; the standard
+            terms above are always among them.
         first_episode: number of the episode that slot 0 plays first; slot ``i`` plays ``first_episode + i``.
-        episode_stride: after an episode a slot plays the one that comes this much later; by default ``num_envs``.
-        varies: what episodes may differ in beside the height of the tote, names of
+        episode_stride: step from the number of a slot's episode to that of its next one; by default ``num_envs``.
+        varies: settings in which episodes may differ besides the height of the tote, names of
             :data:`~pickplace.envs.episode.SETTINGS`.
         **settings: sizes and options of the robot cell, see :class:`~pickplace.rules.cell.CellSpec`.
 
@@ -173,7 +173,7 @@ class PickPlaceEnv(EnvBase):
         sizes = {f"{name}_mask": MASKS[name].size(self.cell) for name in self.masks}
         specs |= {name: Binary(size, (num_envs, size), device, torch.bool) for name, size in sizes.items()}
         self.observation_spec = Composite(specs, shape=(num_envs,), device=device)
-        # Declared as state too, so that reset() is handed what a curriculum writes.
+        # Declared as state too, so that reset() gets what a curriculum writes.
         given = {key: specs[key].clone() for key in self.limits}
         self.state_spec = Composite(given, shape=(num_envs,), device=device)
         self.action_spec = Categorical(self.cell.num_actions, (num_envs,), dtype=torch.int64, device=device)
@@ -184,11 +184,11 @@ class PickPlaceEnv(EnvBase):
         def zeros(*shape, dtype=torch.int64):
             return torch.zeros(num_envs, *shape, dtype=dtype, device=self.device)
 
-        # All run-time state, in buffers, so that state_dict() has it.
+        # All run-time state is in buffers, so that state_dict() contains it.
         buffers = {
             "surface": zeros(*cell.tote_size[:2], dtype=torch.int32) + EMPTY,
             "item": zeros(cell.bin_items, len(Item._fields)),
-            "arrived": zeros(),  # items of the episode so far
+            "arrived": zeros(),  # number of the episode's items so far
             **({"coming": zeros(cell.preview, len(Item._fields))} if cell.preview else {}),
             "volume": zeros(),
             "steps": zeros(),
@@ -212,16 +212,16 @@ class PickPlaceEnv(EnvBase):
 
     # ------------------------------------------------------------------ EnvBase
     def reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
-        """Reset all problems, or those of ``_reset``; the others come back as they are.
+        """Reset all problems, or those in ``_reset``; the others are returned unchanged.
 
         There are no other arguments: ``set_seed`` begins another item stream. TorchRL would fill the other rows with
-        zeros where ``tensordict`` has only ``_reset``, and copy every mask cell by cell where it has more; but all that
-        an agent sees of them is still here.
+        zeros if ``tensordict`` has only ``_reset``, and copy every mask cell by cell if it has more. But all that an
+        agent sees of them is still here.
         """
         if tensordict is None or "_reset" not in tensordict:
             return super().reset(tensordict, **kwargs)
         rows = tensordict["_reset"].reshape(self.num_envs, 1)
-        kwargs.pop("select_reset_only", None)  # of ``EnvBase.reset``: what an agent sees is all that counts here
+        kwargs.pop("select_reset_only", None)  # of ``EnvBase.reset``; the observation is complete in any case
         state = self._reset(tensordict, **kwargs)
         for key in (*DONE_KEYS, "failure"):
             if key in tensordict:
@@ -229,7 +229,7 @@ class PickPlaceEnv(EnvBase):
         return tensordict.exclude("_reset").update(state)
 
     def _set_seed(self, seed: int | None):
-        """Start the item stream over: the next reset of slot ``i`` plays episode ``first_episode + i``."""
+        """Restart the item stream: the next reset of slot ``i`` plays episode ``first_episode + i``."""
         self.item_seed.fill_(0 if seed is None else check_seed(seed))
         first = self.first_episode - self.episode_stride
         self.episode.copy_(torch.arange(first, first + self.num_envs, device=self.device))
@@ -258,8 +258,8 @@ class PickPlaceEnv(EnvBase):
         return self._observation().update({key: torch.zeros_like(rows)[:, None] for key in DONE_KEYS})
 
     def _read_settings(self, given, rows: Tensor) -> None:
-        """Set what the episodes that begin in ``rows``, bool ``[N]``, differ in, by the entries of a TensorDict."""
-        found: dict[str, Tensor] = {}  # kept only once all of them are known to be good
+        """Set the settings of the episodes that begin in ``rows``, bool ``[N]``, from the entries of a TensorDict."""
+        found: dict[str, Tensor] = {}  # stored only after all of them are checked
         for key, (low, high) in self.limits.items():
             setting, values = RESET_ENTRIES[key], self.get_buffer(RESET_ENTRIES[key].field)
             wanted = values.masked_fill(rows, setting.full(self.cell))
@@ -306,7 +306,7 @@ class PickPlaceEnv(EnvBase):
 
     # ------------------------------------------------------------------ state
     def _load_from_state_dict(self, *args, **kwargs):
-        """Load into masks of our own: the last ones have been handed out with an observation, see `_update_masks`."""
+        """Load into copies of the masks: the old tensors were handed out with an observation, see `_update_masks`."""
         for name in self.masks:
             setattr(self, f"{name}_mask", getattr(self, f"{name}_mask").clone())
         super()._load_from_state_dict(*args, **kwargs)
@@ -342,7 +342,7 @@ class PickPlaceEnv(EnvBase):
         return items
 
     def _look_ahead(self) -> None:
-        """Find the items that are seen before they arrive."""
+        """Update the items of the preview."""
         if self.cell.preview:
             self.coming.copy_(coming_items(self.cell, self.items, self.stream, *self._address, self._differs).table)
 
@@ -363,19 +363,19 @@ class PickPlaceEnv(EnvBase):
         make = self._masks_of_empty_totes if empty and self.device.type == "cpu" else self._masks_of
         masks = make(self.state.rows(index))
         mask = next(iter(masks.values()))
-        self.feasible[index] = mask.view(torch.uint8).amax(1) > 0  # as any(1), which is far slower on a CPU
+        self.feasible[index] = mask.view(torch.uint8).amax(1) > 0  # the same as any(1), which is far slower on a CPU
         for name in self.masks:
-            # A tensor of its own: the last one has been handed out with an observation.
+            # A new tensor: the old one was handed out with an observation.
             old, new = getattr(self, f"{name}_mask"), masks[name]
             setattr(self, f"{name}_mask", new if len(numbers) == len(rows) else old.index_copy(0, numbers, new))
 
     def _masks_of(self, state: State) -> dict[str, Tensor]:
-        """Return the masks that are emitted, or ``footprint``, bool ``[M, ...]``, of the states of ``M`` problems."""
+        """Return the masks to emit, or else ``footprint``, for the states of ``M`` problems, bool ``[M, ...]``."""
         maps = placing_maps(self.cell, state)
         return {name: MASKS[name].make(self.cell, maps) for name in self.masks or ("footprint",)}
 
     def _masks_of_empty_totes(self, state: State) -> dict[str, Tensor]:
-        """Return the same as :meth:`_masks_of`; episodes begin in few ways, so what was computed is kept."""
+        """Return the same as :meth:`_masks_of`, from a cache: episodes begin in few different states."""
         item, tote_height = state.items.table.flatten(1), state.tote_height[:, None]
         keys = [tuple(key) for key in torch.cat([item, tote_height], 1).tolist()]
         if unseen := {key: row for row, key in enumerate(keys) if key not in self._starts}:
@@ -390,7 +390,7 @@ class PickPlaceEnv(EnvBase):
         return dict(zip(self.masks or ("footprint",), map(torch.stack, columns), strict=True))
 
     def _observation(self) -> TensorDictBase:
-        """Return what the agent sees, with ``failure`` 0."""
+        """Return the observation, with ``failure`` 0."""
         observation = observe(self.terms, self.cell, self.state)
         observation["occupancy"] = self.exact_occupancy.float()[:, None]
         observation["failure"] = torch.zeros_like(self.tote_height)[:, None]

@@ -1,4 +1,4 @@
-"""Arrival: how bins are filled again from the stream of items."""
+"""Arrival: the refill of bins from the stream of items."""
 
 import torch
 from torch import Tensor
@@ -15,21 +15,21 @@ def refill(
     cell: CellSpec, source: ItemDistribution, stream: str, seed: Tensor, episode: Tensor, arrived: Tensor, items: Item,
     rows: Tensor, differs: Episode = FULL_TASK,
 ) -> tuple[Item, Tensor]:  # fmt: skip
-    """Return the bins after new items arrived, ``[N, M]``, and how many have arrived in all, int64 ``[N]``.
+    """Return the bins after new items arrived, ``[N, M]``, and the number that has arrived in all, int64 ``[N]``.
 
-    Items arrive in the order of the stream. Into an empty bin an item comes at its own place; else at a uniformly
-    random place where it overlaps no other. One that has no room waits, and those after it wait, too. With
-    ``refill="batch"`` only empty bins are filled. With ``cell.tipping`` an item comes in all its poses, or waits, each
-    at the first place that is free.
+    Items arrive in the order of the stream. In an empty bin an item lies at its own place; else at a uniformly random
+    place where it overlaps no other. An item without room waits, and so do those after it. With ``refill="batch"`` only
+    empty bins are filled. With ``cell.tipping`` an item arrives in all its poses, each at the first free place, or
+    waits.
 
     Args:
         cell: has the refill rule, unless episodes differ in it.
         source: the item distribution.
-        stream, seed, episode: as of :meth:`~pickplace.items.distributions.ItemDistribution.sample`.
+        stream, seed, episode: see :meth:`~pickplace.items.distributions.ItemDistribution.sample`.
         arrived: int64 ``[N]``, number of items that have arrived so far.
         items: ``[N, M]``, the first ones filled.
         rows: bool ``[N]``, the bins in which items may arrive.
-        differs: what the episodes differ in.
+        differs: settings in which the episodes differ.
     """
     open_ = rows & may_arrive(cell, items, differs)
     for number in range(0, items.x.shape[1], cell.poses):
@@ -40,7 +40,7 @@ def refill(
         for pose in range(cell.poses):
             posed = in_pose(cell, source, item, pose)
             if must_share(items, open_):
-                # The place among the free ones: any, or with poses the first.
+                # It selects one of the free places at random, or with poses the first.
                 share = hashed_uniform(stream, seed, episode, arrived, 4)[3] * (not cell.tipping)
                 keeps_place = ~items.exists[:, 0] | (source.has_corners and not cell.tipping)
                 posed = find_room(cell, posed, items, keeps_place, share)
@@ -56,7 +56,7 @@ def next_item(
     cell: CellSpec, source: ItemDistribution, stream: str, seed: Tensor, episode: Tensor, arrived: Tensor,
     differs: Episode,
 ) -> Item:  # fmt: skip
-    """Return the item that arrives next in each episode, ``[N]``, at its own place; arguments as of :func:`refill`."""
+    """Return the item that arrives next in each episode, ``[N]``, at its own place; arguments: see :func:`refill`."""
     item = source.sample(stream, seed, episode, arrived, cell.bin_size, **source.of_mix(differs.item_mix))
     return item if differs.turns is None else item._replace(turns=item.turns & differs.turns)
 
@@ -65,9 +65,9 @@ def coming_items(
     cell: CellSpec, source: ItemDistribution, stream: str, seed: Tensor, episode: Tensor, arrived: Tensor,
     differs: Episode = FULL_TASK,
 ) -> Item:  # fmt: skip
-    """Return the items that are seen before they arrive, in their order, ``[N, p]``; arguments as of :func:`refill`.
+    """Return the items of the preview, in their order, ``[N, p]``; arguments: see :func:`refill`.
 
-    Each is at its own place. Rows of zeros are no items: after the stream's end, and beyond an episode's own preview.
+    Each is at its own place. Rows are zeros after the stream's end, and beyond an episode's own preview.
     """
     count, number = len(arrived), torch.arange(cell.preview, device=arrived.device)
     row = torch.arange(count, device=arrived.device).repeat_interleave(cell.preview)

@@ -22,12 +22,12 @@ class Cut(ItemDistribution):
 
     CUT-1 and CUT-2 of Zhao et al., "Online 3D Bin Packing with Constrained Deep Reinforcement Learning", AAAI 2021,
     arXiv 2006.14978, section 4 and Algorithm 3 of its supplement. The container is cut in two again and again: a piece
-    with a side above the greatest is cut across such a side, drawn at random; the others are the items. They arrive
+    with a side above the greatest is cut across such a side, drawn at random. The others are the items. They arrive
 
     * CUT-1, ``order="z"``: by the height of their lower faces in the container, lowest first, equal ones at random;
-    * CUT-2, ``order="stacking"``: each time, one of those that lie on the floor or on items that have arrived.
+    * CUT-2, ``order="stacking"``: at random, but each item after all items on which it lies.
 
-    The paper leaves open, and we chose:
+    The paper leaves the following open, and we chose:
 
     * How the place of a cut is drawn. Ours is uniform over the places that leave two parts which can be cut into
       allowed sides. Any place, as Algorithm 3 reads, also gives parts below the least side, which it never finishes.
@@ -53,7 +53,7 @@ class Cut(ItemDistribution):
         least, greatest = check_range("items.sides", sides)
         key = f"items.container={[*self.container]}, items.sides={[least, greatest]}"
         self._greatest, longest = greatest, max(self.container)
-        # A length can be cut into allowed sides if some number of them may be as short and as long in all.
+        # A length can be cut into n allowed sides if it is between n * least and n * greatest, for some n.
         fits = [-(-length // greatest) * least <= length for length in range(longest + 1)]
         if bad := [side for side in self.container if not fits[side]]:
             raise ValueError(f"{key}: sides of {least} to {greatest} do not add up to {bad[0]}; expected some that do.")
@@ -64,7 +64,7 @@ class Cut(ItemDistribution):
             [at for at in range(least, length - least + 1) if length > greatest and fits[at] and fits[length - at]]
             for length in range(longest + 1)
         ]
-        arising: list[set[int]] = []  # the sides that come of each length
+        arising: list[set[int]] = []  # the sides to which cuts of each length lead
         for length, places in enumerate(cuts):
             arising.append({length} if length <= greatest else set().union(*(arising[at] for at in places)))
         sides_of_items = [sorted(arising[side]) for side in self.container]
@@ -86,11 +86,11 @@ class Cut(ItemDistribution):
         return item.map(lambda part: torch.where(item.exists, part, 0))
 
     def _sizes(self, stream: str, seed: Tensor, episode: Tensor) -> list[list[list[int]]]:
-        """Return the ``w, d, h`` of the items of whole episodes, as of :meth:`boxes`."""
+        """Return the ``w, d, h`` of the items of whole episodes, see :meth:`boxes`."""
         return [boxes[:, 3:].tolist() for boxes in self.boxes(stream, seed, episode)]
 
     def boxes(self, stream: str, seed: Tensor, episode: Tensor) -> list[Tensor]:
-        """Return the items of whole episodes where they were cut: they tile the container.
+        """Return the items of whole episodes at their places in the container, which they tile.
 
         Args:
             stream: family of item streams.
@@ -100,7 +100,7 @@ class Cut(ItemDistribution):
             For each episode int64 ``[n, 6]``, the ``x, y, z, w, d, h`` of its items in their order of arrival.
         """
         cut = self._cut(stream, seed, episode)
-        # Row by row; within a row the lower come first, so that a stable sort keeps an item after its supporters.
+        # Row by row; within a row, lower items come first, so that a stable sort keeps an item after its supporters.
         index = torch.argsort(cut[0] * self.container[2] + cut[1][:, 2], stable=True)
         row, low, high, uniform = (part[index] for part in cut)
         counts = torch.bincount(row, minlength=len(episode))
@@ -119,8 +119,8 @@ class Cut(ItemDistribution):
     def _cut(self, stream: str, seed: Tensor, episode: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return the items of episodes, ``[B]`` in all: the episode's row, two corners ``[B, 3]``, a uniform number.
 
-        All pieces are cut at once, round by round. A piece has the numbers of its own place in the container, so that
-        the order of the cuts does not matter.
+        All pieces are cut at once, round by round. A piece's random numbers depend only on its place in the
+        container, so that the order of the cuts does not matter.
         """
         (_, depth, height), volume = self.container, math.prod(self.container)
         row, low = torch.arange(len(episode)), torch.zeros(len(episode), 3, dtype=torch.int64)
@@ -128,7 +128,7 @@ class Cut(ItemDistribution):
         done = []
         while len(row):
             first, last = ((cell[:, 0] * depth + cell[:, 1]) * height + cell[:, 2] for cell in (low, high - 1))
-            address = -1 - (first * volume + last)  # below 0: at the steps lie where the items are in the bin
+            address = -1 - (first * volume + last)  # below 0: steps from 0 place the items in the bin
             side_number, place_number, order_number = hashed_uniform(stream, seed[row], episode[row], address, 3)
             rank = (high - low > self._greatest).cumsum(1)  # [B, 3]
             long = rank[:, -1] > 0
@@ -143,10 +143,10 @@ class Cut(ItemDistribution):
         return tuple(map(torch.cat, zip(*done, strict=True)))  # type: ignore[return-value]
 
     def _arrival(self, low: Tensor, high: Tensor, uniform: Tensor) -> Tensor:
-        """Return times whose order is that of CUT-2, float64 ``[E, K]``.
+        """Return times of arrival that give the order of CUT-2, float64 ``[E, K]``.
 
-        Each item arrives an exponentially distributed time after the last of those that it lies on. Because such a
-        time has no memory, the next to arrive is any of the items that may, with the same probability.
+        Each item arrives an exponentially distributed time after the last item on which it lies. Because such a
+        time has no memory, all items that may arrive next are equally likely.
 
         Args:
             low, high: int64 ``[E, K, 3]``, two corners of each item.

@@ -1,7 +1,7 @@
-"""Item distributions: which item arrives next, and where it lies in its bin.
+"""Item distributions: the item that arrives next, and its place in the bin.
 
-An item is a counter-based hash of (stream, seed, episode, step), so there is no generator to save, the items do not
-depend on the batch size, and every method that plays an episode meets the same ones.
+An item is a counter-based hash of (stream, seed, episode, step). So there is no generator to save, the items do not
+depend on the batch size, and every method that plays an episode gets the same items.
 """
 
 import math
@@ -18,9 +18,9 @@ from pickplace.common.files import read_table
 from pickplace.common.validate import at_most, excerpt, expect, flag, is_number, is_whole, refuse_any, whole_number
 from pickplace.rules.item import ALL_TURNS, MAX_GRAMS, NO_LIMIT, Item
 
-#: Families of item streams that never meet: what is trained on, what picks the best checkpoint, what is reported.
+#: Families of item streams that share no episodes: to train, to select the best checkpoint, and to report results.
 STREAMS = ("train", "validation", "test")
-MAX_SEED = 2**62  # beyond it, seeds of two families could meet
+MAX_SEED = 2**62  # above it, seeds of two families could coincide
 
 MAX_LENGTH = 2**31 - 1  # of a side, in cells or height units
 MAX_KINDS = 100_000  # of items: more would fill the memory
@@ -30,13 +30,13 @@ PAPER_KINDS = ((1, 1, 1), (2, 1, 1), (1, 2, 1), (2, 2, 1))
 
 
 def check_seed(seed, key: str = "seed") -> int:
-    """Return the seed, or raise a ``ValueError`` that names the ``key`` if it is none."""
+    """Return the seed, or raise a ``ValueError`` that names the ``key`` if it is not valid."""
     expect(is_whole(seed) and 0 <= seed < MAX_SEED, key, seed, "a whole number >= 0 and < 2**62")
     return int(seed)
 
 
 def _mix(x: Tensor) -> Tensor:
-    """Return int64 counters scrambled (the finalizer of MurmurHash3, Appleby 2011)."""
+    """Return scrambled int64 counters (the finalizer of MurmurHash3, Appleby 2011)."""
     for factor in (-0x00AE502812AA7333, -0x3B314601E57A13AD):
         x = _shifted(x).mul_(factor)
     return _shifted(x)
@@ -47,7 +47,7 @@ def _shifted(x: Tensor) -> Tensor:
 
 
 def hashed_uniform(stream: str, seed: Tensor, episode: Tensor, step: Tensor, count: int) -> Tensor:
-    """Return uniform numbers in [0, 1), float64 ``[count, N]``, that depend on the item's address alone."""
+    """Return uniform numbers in [0, 1), float64 ``[count, N]``, that depend only on the item's address."""
     factor, offset = 0x2545F4914F6CDD1D, 0x1B873593
     key = _mix(seed * factor + (STREAMS.index(stream) + 1 + offset))
     for part in (episode, step):
@@ -58,7 +58,7 @@ def hashed_uniform(stream: str, seed: Tensor, episode: Tensor, step: Tensor, cou
 
 
 def place_at_random(size: Tensor, across: Tensor, along: Tensor, bin_size, kind: Tensor | None = None) -> Item:
-    """Return items of given sizes, int64 ``[N, 3]``, in the bin, at places that two uniform numbers decide, ``[N]``."""
+    """Return items of given sizes, int64 ``[N, 3]``, at places in the bin that two uniform numbers select, ``[N]``."""
     w, d, h = size.unbind(-1)
     x, y = (across * (bin_size[0] + 1 - w)).long(), (along * (bin_size[1] + 1 - d)).long()
     return Item(x, y, w, d, h, kind)
@@ -85,16 +85,16 @@ class ItemDistribution:
     Attributes:
         sizes: int64 ``[K, 3]``, every size ``(w, d, h)`` that may arrive, in cells and height units.
         varies: whether episodes differ at all.
-        sequential: whether an episode is a sequence whose order a search must not know: it samples from ``sizes``.
-        has_corners: whether each item has one place in the bin, so that of several items one waits for its place.
-        mixes: number of mixes of the sizes among which episodes may choose, see :meth:`mixed`; 1: there is one.
-        volumes: float64 ``[K]``, the true volume of each kind, in cells times height units, where ``sizes`` are rounded
+        sequential: whether the order of an episode must be hidden from a search, which then samples from ``sizes``.
+        has_corners: whether items have fixed places in the bin. An item whose place is not free then waits.
+        mixes: number of mixes of the sizes that an episode may have, see :meth:`mixed`.
+        volumes: float64 ``[K]``, the true volume of each kind, in cells times height units, if ``sizes`` are rounded
             up; None: the sizes are exact.
-        handling: int64 ``[K, 3]``, columns ``turns``, ``grams`` and ``max_load`` of each kind, as of an
+        handling: int64 ``[K, 3]``, columns ``turns``, ``grams`` and ``max_load`` of each kind, see
             :class:`~pickplace.rules.item.Item`; None: any turn, no mass, any load.
         tipped_turns: int64 ``[K, 2]``, the ``turns`` of each kind on its two other pairs of faces, see
             :mod:`pickplace.items.tipping`; None: those of the upright item.
-        longest_episode: how many items come in an episode at most; None: episodes do not end.
+        longest_episode: greatest number of items in an episode; None: episodes do not end.
     """
 
     sizes: Tensor
@@ -116,13 +116,13 @@ class ItemDistribution:
             stream: family of item streams.
             seed, episode, step: int64 ``[N]``.
             bin_size: ``(W_B, D_B, ...)``.
-            mix: int64 ``[N]``, the mix of each episode; None: mix 0. Given only where :attr:`mixes` is above 1.
+            mix: int64 ``[N]``, the mix of each episode; None: mix 0. Given only if :attr:`mixes` is above 1.
         """
         uniform, across, along = hashed_uniform(stream, seed, episode, step, 3)
         return self.of_kind(self._index(uniform, step, mix), across, along, bin_size)
 
     def of_kind(self, kind: Tensor, across: Tensor, along: Tensor, bin_size) -> Item:
-        """Return items of kinds, int64 ``[N]``, in the bin, at places that two uniform numbers decide, ``[N]``."""
+        """Return items of kinds, int64 ``[N]``, at places in the bin that two uniform numbers select, ``[N]``."""
         item = place_at_random(self.sizes.to(kind.device)[kind], across, along, bin_size, kind)
         if self.handling is None:
             return item
@@ -131,7 +131,7 @@ class ItemDistribution:
 
     @property
     def has_limits(self) -> bool:
-        """Whether some kind forbids a turn, or bears a limited load only."""
+        """Whether some kind forbids a turn, or bears only a limited load."""
         if self.handling is None:
             return False
         turns, _, max_load = self.handling.unbind(-1)
@@ -142,18 +142,18 @@ class ItemDistribution:
         return ALL_TURNS if self.handling is None else int(self.handling[kind, 0])
 
     def _index(self, uniform: Tensor, step: Tensor, mix: Tensor | None = None) -> Tensor:
-        """Return which row of ``sizes`` arrives, int64 ``[N]``."""
+        """Return the row of ``sizes`` that arrives, int64 ``[N]``."""
         raise NotImplementedError
 
     def num_episodes(self, stream: str) -> int | None:
-        """Return how many different episodes a stream has; later ones repeat them. None: each is another."""
+        """Return the number of different episodes of a stream; later ones repeat them. None: all are different."""
 
     def num_items(self, stream: str, seed: Tensor, episode: Tensor) -> Tensor:
-        """Return how many items arrive in each episode, int64 ``[N]``; 0: they do not end."""
+        """Return the number of items that arrive in each episode, int64 ``[N]``; 0: the episodes do not end."""
         return torch.zeros_like(episode)
 
     def of_mix(self, mix: Tensor | None) -> dict[str, Tensor]:
-        """Return the argument of :meth:`sample` and :meth:`spread` that names a mix; without mixes there is none."""
+        """Return the argument ``mix`` of :meth:`sample` and :meth:`spread`; an empty dict without mixes."""
         return {} if mix is None or self.mixes == 1 else {"mix": mix}
 
     def mixed(self, changes: Sequence[Mapping]) -> Self:
@@ -168,7 +168,7 @@ class ItemDistribution:
         raise ValueError(f"items: {type(self).__name__} has no mixes; expected items=kinds or items=uniform.")
 
     def arrives(self, mix: int = 0) -> Tensor:
-        """Return which rows of ``sizes`` may arrive in a mix, bool ``[K]``."""
+        """Return a mask of the rows of ``sizes`` that may arrive in a mix, bool ``[K]``."""
         return torch.ones(len(self.sizes), dtype=torch.bool)
 
     def tallest(self, mix: int = 0) -> int:
@@ -176,7 +176,7 @@ class ItemDistribution:
         return int(self.sizes[self.arrives(mix), 2].max())
 
     def spread(self, seed: Tensor, rank: Tensor, count: int, bin_size, mix: Tensor | None = None) -> Item:
-        """Return the ``rank``-th of ``count`` items for each seed, int64 ``[N]``; here simply independent ones."""
+        """Return the ``rank``-th of ``count`` items for each seed, int64 ``[N]``; here they are independent."""
         return self.sample("train", seed, rank, torch.zeros_like(rank), bin_size, **self.of_mix(mix))
 
     def corners(self, kind: int, bin_size) -> list[tuple[int, int]]:
@@ -222,7 +222,7 @@ class Kinds(ItemDistribution):
 
     @staticmethod
     def _edges_of(share: Tensor) -> Tensor:
-        """Return where the kinds of mix ``m`` meet in ``[m, m + 1)``, for all mixes ``[mixes * (K - 1)]``."""
+        """Return the limits between the kinds, of mix ``m`` in ``[m, m + 1)``, for all mixes, ``[mixes * (K - 1)]``."""
         edges = (share.cumsum(1) / share.sum(1, keepdim=True))[:, :-1]
         return (edges + torch.arange(len(edges))[:, None]).flatten()
 
@@ -230,7 +230,7 @@ class Kinds(ItemDistribution):
         edges = self._edges.to(uniform.device)
         if mix is None:
             return torch.searchsorted(edges[: len(self.sizes) - 1], uniform, right=True)
-        # Below the next mix in spite of rounding.
+        # The clamp keeps the number below the next mix, in spite of rounding.
         place = torch.searchsorted(edges, uniform.clamp(max=1 - 2**-32) + mix, right=True)
         return place - mix * (len(self.sizes) - 1)
 
@@ -238,8 +238,8 @@ class Kinds(ItemDistribution):
         """Return this distribution with further mixes of its kinds, numbered from 1; mix 0 is itself.
 
         Args:
-            changes: of each mix, ``weights``, a relative frequency for each kind; or any of ``width``, ``depth`` and
-                ``height``, ``[least, greatest]``: the kinds of such sizes, as frequent among themselves as in mix 0.
+            changes: for each mix ``weights``, a relative frequency for each kind; or any of ``width``, ``depth`` and
+                ``height``, ``[least, greatest]``: only the kinds in these ranges, in the proportions of mix 0.
 
         Raises:
             ValueError: naming the setting.
@@ -273,8 +273,8 @@ class Kinds(ItemDistribution):
     def spread(self, seed: Tensor, rank: Tensor, count: int, bin_size, mix: Tensor | None = None) -> Item:
         """Return the ``rank``-th of ``count`` items for each seed, int64 ``[N]``: a systematic sample of the kinds.
 
-        Each kind is there in proportion to its frequency, up to a whole number. So with as many items as there are
-        equally likely kinds each comes once.
+        The number of items of each kind is in proportion to its frequency, up to rounding. So with as many items as
+        there are equally likely kinds, each kind comes once.
         """
         first = torch.zeros_like(rank)
         start = hashed_uniform("train", seed, torch.full_like(rank, count), first, 1)[0]
@@ -301,7 +301,7 @@ class Uniform(Kinds):
 
 
 def _read_handling(count: int, turns, grams, max_load) -> Tensor:
-    """Return the ``handling`` of kinds from a list for each column, or None; ``ValueError`` for others."""
+    """Return the ``handling`` of kinds from a list, or None, for each column; raise ``ValueError`` for other values."""
 
     def column(key: str, values, default, expected: str, is_good: Callable[[Any], bool]) -> list:
         values = [default] * count if values is None else values
@@ -357,7 +357,7 @@ class Recorded(ItemDistribution):
         numbers = torch.tensor([[int(field) for field in row] for _, row in table])
         self.sizes, self._corner = numbers[:, :3], numbers[:, 3:]
         self.has_corners = self._corner.numel() > 0
-        self.varies = not self.has_corners  # else not even where the items lie
+        self.varies = not self.has_corners  # with corners, even the places of the items are the same
 
     def sample(self, stream, seed, episode, step, bin_size, mix=None):
         item = super().sample(stream, seed, episode, step, bin_size, mix)
@@ -380,7 +380,7 @@ class Recorded(ItemDistribution):
 
 
 def search_items(items: ItemDistribution) -> ItemDistribution:
-    """Return the distribution that a search samples from: of a sequence only its sizes, equally likely."""
+    """Return the distribution from which a search samples: for a sequence, its sizes with equal probability."""
     if not items.sequential:
         return items
     kinds = Kinds(items.sizes.tolist())

@@ -5,16 +5,16 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-#: Number of episodes that are kept, or twice as many as are played side by side.
+#: Greatest number of episodes that are kept, or twice the number played side by side if that is more.
 KEPT_EPISODES = 1024
 
 
 class KeptEpisodes:
-    """The sequences of episodes.
+    """Cache of the sequences of episodes.
 
     Args:
         make: ``make(stream, seed, episode)`` returns the sequences of episodes ``[E]``, one for each.
-        at_once: most episodes that it is asked for in one call, for its memory.
+        at_once: greatest number of episodes in one call of ``make``, for its memory.
     """
 
     def __init__(self, make: Callable[[str, Tensor, Tensor], Sequence[Sequence]], at_once: int):

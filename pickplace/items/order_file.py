@@ -61,11 +61,11 @@ class OrderItem(NamedTuple):
     grams: int  # rounded up
     place: str  # the file and where in it, for messages, such as "orders.csv, line 7"
     max_load: int = NO_LIMIT  # greatest mass on top of it, g, rounded down
-    orientations: tuple[str, ...] = ORIENTATIONS  # those that are allowed
+    orientations: tuple[str, ...] = ORIENTATIONS  # the allowed ones
 
     @property
     def kind(self) -> tuple:
-        """All but its id and its place in the file."""
+        """All fields but its id and its place in the file."""
         return *self[1:5], *self[6:]
 
     @property
@@ -85,7 +85,7 @@ class OrderItem(NamedTuple):
 
     @property
     def has_limits(self) -> bool:
-        """Whether it bears a limited load only, or forbids a quarter turn about z, on a face that may be the lowest."""
+        """Whether it bears only a limited load, or forbids a quarter turn about z on a face on which it may lie."""
         pairs = zip(ORIENTATIONS[::2], ORIENTATIONS[1::2], strict=True)
         return self.max_load < NO_LIMIT or any(len({*pair} & {*self.orientations}) == 1 for pair in pairs)
 
@@ -104,19 +104,19 @@ class _Row(NamedTuple):
     header: tuple[str, ...]
     values: tuple
     header_place: str
-    decimal: str = "."  # what stands before decimals, beside a point
+    decimal: str = "."  # decimal separator that is accepted beside a point
 
 
 class _Column(NamedTuple):
     key: str  # in the file
     unit: float  # of its values, in mm or g
-    decimal: str  # what stands before decimals, beside a point
+    decimal: str  # decimal separator that is accepted beside a point
 
     def number(self, row: Mapping) -> float:
-        """Return the value in a row as a number, in the unit of the column; a ``ValueError`` if it is none."""
+        """Return the value in a row as a number, in the unit of the column; raise ``ValueError`` if it is none."""
         value = row[self.key]
         refuse_if(isinstance(value, bool), "a bool is no number")
-        if isinstance(value, str) and self.decimal == "," and self.unit == 1:  # mm or g, which have no three decimals
+        if isinstance(value, str) and self.decimal == "," and self.unit == 1:  # mm or g: no three decimals
             refuse_if(re.fullmatch(r"\s*\d{1,3}(,\d{3})+\s*", value), "a comma that may separate thousands")
         return float(value.replace(self.decimal, ".") if isinstance(value, str) else value)
 
@@ -126,18 +126,18 @@ def read_orders(path, unit: str = "mm", key: str = "items.path", target: str | N
 
     A CSV has a header and a line for each item, or for each article with its ``quantity``. Commas, semicolons or tabs
     separate the columns; with semicolons or tabs, decimals may have a comma. Lines with the same
-    ``order`` are one order; without that column the file is one. JSON is that of BED-BPP: for each order
+    ``order`` are one order; without that column the whole file is one. JSON is that of BED-BPP: for each order
     ``item_sequence``, its items by their number.
 
-    Of each item the columns ``max_load`` (empty: any), ``stackable`` or ``nothing_on_top`` (yes or no) and
-    ``orientations`` may say what is allowed: :data:`WORDS`, or some of :data:`ORIENTATIONS`.
+    Optional columns limit an item: ``max_load`` (empty: any), ``stackable`` or ``nothing_on_top`` (yes or no), and
+    ``orientations`` (:data:`WORDS`, or some of :data:`ORIENTATIONS`).
 
     Args:
         path: the file; ``.json``, else CSV in UTF-8.
-        unit: of lengths without one in the header, ``"mm"``, ``"cm"`` or ``"m"``. Weights without one are in kg.
+        unit: unit of lengths without one in the header, ``"mm"``, ``"cm"`` or ``"m"``. Weights without one are in kg.
         key: the setting that names the file.
-        target: what an order is for, in the column ``target``, or in ``properties`` of BED-BPP; only these orders are
-            returned. None: all.
+        target: return only the orders with this value in the column ``target``, or in ``properties`` of BED-BPP; None:
+            all.
 
     Raises:
         ValueError: naming the file, and the line of a value that cannot be used.
@@ -269,13 +269,13 @@ def _read_header(place: str, header: Sequence, unit: str, decimal: str) -> dict[
 
 
 def _printable(name) -> str:
-    """Return a name of a file without what could change a terminal or break a line; "" for none."""
+    """Return a name from a file with "?" for each control character or line break; "" for None."""
     text = "" if name is None else str(name)
     return "".join(letter if letter.isprintable() else "?" for letter in text)[:MAX_NAME]
 
 
 def _read_row(place: str, row: Mapping, columns: dict[str, _Column]) -> tuple[OrderItem, str, int]:
-    """Return the item of a row, the name of its order, and how many there are."""
+    """Return the item of a row, the name of its order, and the number of such items."""
 
     def read(name: str, most: float) -> float:
         key, unit, _ = columns[name]
@@ -318,7 +318,7 @@ def _read_max_load(place: str, row: Mapping, columns: dict[str, _Column]) -> int
 
 
 def _read_orientations(place: str, row: Mapping, columns: dict[str, _Column]) -> tuple[str, ...]:
-    """Return how the item of a row may lie."""
+    """Return the orientations that the item of a row allows."""
     value = row[columns["orientations"].key] if "orientations" in columns else None
     if value in ("", None):
         return ORIENTATIONS

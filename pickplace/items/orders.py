@@ -1,4 +1,4 @@
-"""Orders: an episode is an order of a file, or one that is drawn like them."""
+"""Orders: an episode is an order of a file, or a new one, drawn from the lines of these."""
 
 import math
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from pickplace.items.distributions import MAX_KINDS, MAX_LENGTH, ItemDistributio
 from pickplace.items.kept import KeptEpisodes
 from pickplace.items.order_file import MILLIMETRES, OrderItem, read_orders
 
-#: Shares of the orders that validate and test; the others train. Each has one at least.
+#: Shares of the orders for validation and test; the others are for training. Each stream has at least one.
 SHARES = {"validation": 0.1, "test": 0.2}
 ROUNDING = 1e-6  # of a cell: three cells of 0.05 m are not exactly 0.15 m in binary fractions
 
@@ -20,20 +20,20 @@ ROUNDING = 1e-6  # of a cell: three cells of 0.05 m are not exactly 0.15 m in bi
 class Orders(ItemDistribution):
     """The orders of a file: an episode is one order, and its items arrive in the order's sequence.
 
-    Train, validation and test have different orders, drawn at random, the same each time; or test has all. An order
-    that is in the file twice counts once. Validation and test play each of theirs once.
+    Train, validation and test have different orders, by a random split that is always the same; or test has all. An
+    order that is in the file twice counts once. Validation and test play each of their orders once.
 
     Sides are rounded up to whole cells and height units; :attr:`volumes` has the true volumes.
 
     Args:
-        path: of the file, see :func:`~pickplace.items.order_file.read_orders`.
+        path: the file, see :func:`~pickplace.items.order_file.read_orders`.
         cell_size: side of a cell, m.
-        height_unit: of a height, in cells.
-        unit: of lengths in the file without a unit in the header, ``"mm"``, ``"cm"`` or ``"m"``.
-        generate: train with new orders, made of the lines of those that train. A line is an article that comes several
-            times in a row; it is as early or late as in its own order. False: train with the orders as they are.
+        height_unit: unit of heights, in cells.
+        unit: unit of lengths in the file that have none in the header, ``"mm"``, ``"cm"`` or ``"m"``.
+        generate: train with new orders, drawn from the lines of the training orders. A line is a run of one article; it
+            is as early or late as in its own order. False: train with the orders as they are.
         target: only the orders for this target, see :func:`~pickplace.items.order_file.read_orders`; None: all.
-        split: False: test has all orders, and nothing can be trained or validated.
+        split: False: test has all orders, and there are none for training and validation.
 
     Attributes:
         volumes: float64 ``[K]``, the true volume of each kind, in cells times height units.
@@ -79,7 +79,7 @@ class Orders(ItemDistribution):
         self._kept = KeptEpisodes(self._play, max(1, 2**22 // self._lines.most))
 
     def _number(self, item: OrderItem, kinds: dict) -> int:
-        """Return the number of an item's kind: of its sides, its weight, and what it allows."""
+        """Return the number of an item's kind: its sides, weight, greatest load and orientations."""
         refuse_if(
             not item.turns,
             f"{item.place}: orientations={' '.join(item.orientations)}: expected lwh or wlh among them; with "
@@ -112,7 +112,7 @@ class Orders(ItemDistribution):
         return item.map(lambda part: torch.where(kind >= 0, part, 0))
 
     def _play(self, stream: str, seed: Tensor, episode: Tensor) -> Sequence[Sequence[int]]:
-        """Return the kinds that arrive in episodes, int64 ``[E]``."""
+        """Return the kinds that arrive in each of some episodes, int64 ``[E]``, in their order."""
         orders = self._orders[stream]
         refuse_if(
             not orders, f"items.split=false: all orders are to test on; expected true, to have some for {stream}."
@@ -132,7 +132,7 @@ class Orders(ItemDistribution):
 class _Lines:
     """Orders drawn from the lines of others.
 
-    A line is an article that comes several times in a row. It has a place in its order, from 0 at the beginning to 1.
+    A line is a run of one article. It has a place in its order, from 0 at the beginning to 1.
     """
 
     def __init__(self, orders: Sequence[Sequence[int]]):
@@ -156,7 +156,7 @@ class _Lines:
         seed, episode = (part.repeat_interleave(self.most + 1) for part in (seed, episode))
         uniform = hashed_uniform("train", seed, episode, numbers, 1).view(-1, self.most + 1)
         length = self.lengths[(uniform[:, :1] * len(self.lengths)).long()]
-        line = (uniform[:, 1:] * len(self.kinds)).long()  # as many as may be needed: each has one item at least
+        line = (uniform[:, 1:] * len(self.kinds)).long()  # as many as may be needed: each has at least one item
         counts = self.counts[line]
         taken = torch.minimum(counts, (length - counts.cumsum(1) + counts).clamp(min=0))
         rank = torch.where(taken > 0, self.places[line], torch.inf).argsort(dim=1, stable=True)
@@ -165,7 +165,7 @@ class _Lines:
 
 
 def _split(orders: Sequence[Sequence[int]]) -> dict[str, list[Sequence[int]]]:
-    """Return the orders that train, validate and test."""
+    """Return the orders for training, validation and test."""
     zeros = torch.zeros(len(orders), dtype=torch.int64)
     numbers = hashed_uniform("train", zeros, zeros, torch.arange(len(orders)), 1)[0].argsort().tolist()
     shuffled = [orders[number] for number in numbers]

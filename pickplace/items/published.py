@@ -18,12 +18,12 @@ EXPECTED = "a list of sequences of items [w, d, h], as .json, or as the .pt of t
 
 
 def published(drawn: ItemDistribution, path=None, end=None) -> ItemDistribution:
-    """Return the items of a paper: drawn ones; with a file, its sequences on the test stream, and drawn ones elsewhere.
+    """Return the items of a paper: with a file, its sequences on the test stream; drawn items elsewhere.
 
     Args:
-        drawn: the distribution that trains and validates, and tests where there is no file.
-        path: of the file, see :func:`read_sequences`; None: there is none.
-        end: as of :func:`read_sequences`.
+        drawn: the distribution for training and validation, and for tests without a file.
+        path: the file, see :func:`read_sequences`; None: there is none.
+        end: see :func:`read_sequences`.
 
     Raises:
         ValueError: for a file that cannot be used.
@@ -40,7 +40,7 @@ class Published(ItemDistribution):
     The test stream has an episode for each sequence, whatever the seed. A search samples from the other distribution,
     and does not know the sequences.
 
-    Args: as of :func:`published`.
+    For the arguments see :func:`published`.
     """
 
     def __init__(self, drawn: ItemDistribution, path, end: Sequence[int] | None = None):
@@ -106,7 +106,7 @@ def read_sequences(path, end: Sequence[int] | None = None) -> list[list[tuple[in
         end: size of the item that ends each sequence of the authors' files; it is left out.
 
     Raises:
-        ValueError: naming the file, and the line, or the sequence and the item, of what cannot be used.
+        ValueError: naming the file, and the line, or the sequence and the item, that cannot be used.
     """
     expect(os.path.exists(str(path)), "items.path", str(path), f"a file, {EXPECTED}")
     path = Path(path)
@@ -127,7 +127,7 @@ def read_sequences(path, end: Sequence[int] | None = None) -> list[list[tuple[in
 
 
 def _load(path: Path, content: bytes) -> Any:
-    """Return what a file holds; of a ``.pt`` numbers and lists only, as it could make anything else."""
+    """Return the content of a file; from a ``.pt`` only plain data, as it could run any code otherwise."""
     if path.suffix.lower() == ".pt":
         with reworded(Exception, lambda error: ValueError(f"{path}: it is not read by torch; expected {EXPECTED}.")):
             return torch.load(io.BytesIO(content), weights_only=True)

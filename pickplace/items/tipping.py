@@ -1,6 +1,6 @@
 """Tipping: the poses in which an item may be put down, one for each of its three pairs of faces.
 
-With ``env.tipping`` an item lies in the bin once in each pose. The pick of one takes the item, so that the others leave
+With ``env.tipping`` an item lies in the bin once in each pose. A pick of one pose takes the item: the others leave
 the bin, too. Poses follow one another in the bin's table: upright as it arrives, then ``w, h, d``, then ``d, h, w``.
 """
 
@@ -12,18 +12,17 @@ from pickplace.items.distributions import ItemDistribution
 from pickplace.rules.cell import POSES, CellSpec
 from pickplace.rules.item import ALL_TURNS, Item
 
-#: Of each pose, the columns of the item's sides that lie along x, y and z.
+#: For each pose, the columns of the item's sides along x, y and z.
 SIDES = (("w", "d", "h"), ("w", "h", "d"), ("d", "h", "w"))
 
 
 def in_pose(cell: CellSpec, source: ItemDistribution, item: Item, pose: int) -> Item:
-    """Return items that arrive, ``[N]``, as they lie in a pose, in the corner of the bin; without ``tipping`` as they
-    are.
+    """Return arriving items, ``[N]``, as they lie in a pose, in the corner of the bin; unchanged without ``tipping``.
 
     Args:
         cell: says whether items may be tipped.
         source: the item distribution; its ``tipped_turns`` say how a tipped item may be turned, None: as upright.
-        item: as it arrives.
+        item: the items as they arrive.
         pose: 0, 1 or 2.
     """
     if not cell.tipping:
@@ -48,7 +47,7 @@ def longest_side(cell: CellSpec, items: ItemDistribution) -> int:
 
 
 def check_tipping(cell: CellSpec, items: ItemDistribution) -> None:
-    """Refuse items that a cell with ``tipping`` does not serve.
+    """Refuse items that a cell with ``tipping`` cannot handle.
 
     Raises:
         ValueError: naming the setting, and what was expected.

@@ -1,1 +1,1 @@
-"""The rules of picking and placing: torch, and nothing else of pickplace but ``common``."""
+"""The rules of picking and placing: they use torch, and of pickplace only ``common``."""

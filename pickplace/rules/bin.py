@@ -1,8 +1,8 @@
-"""A bin with several items: which one a pick takes, what stands in the way, and where others have room.
+"""A bin with several items: the item that a pick takes, the picks that others block, and the room for new items.
 
-Each pick takes one item: the highest that the cup grips. The end effector may hang over lower ones; one that is as high
-or higher would be lifted, too, or hit. Nothing is in the way of an item that lies alone: with ``M = 1`` the
-functions take a shorter path to the same result.
+Each pick takes one item: the highest that the cup grips. The end effector may hang over lower items. An item that is as
+high or higher blocks the pick, as it would be lifted or hit. An item that lies alone is never blocked: with ``M = 1``
+the functions take a shorter path to the same result.
 """
 
 from functools import reduce
@@ -17,13 +17,13 @@ from pickplace.rules.state import REFILLS, Episode, State
 
 
 def blocked_picks(cell: CellSpec, items: Item) -> Tensor | None:
-    """Return at which pick cells the end effector would touch another item that is as high or higher.
+    """Return a mask of the pick cells at which the end effector would touch another item that is as high or higher.
 
     Args:
         items: ``[N, M]``.
 
     Returns:
-        bool ``[N * M, P]``, for each item, those of a bin one after the other, the picks that would take it; None with
+        bool ``[N * M, P]``, for each item as the one to take; the items of a bin follow one another. None with
         ``M = 1``: no pick is blocked.
     """
     if (count := items.x.shape[1]) == 1:
@@ -46,11 +46,11 @@ def blocked_picks(cell: CellSpec, items: Item) -> Tensor | None:
 
 
 def take_item(cell: CellSpec, items: Item, action: Tensor) -> tuple[Tensor, Item, Tensor | None]:
-    """Return what flat actions, int64 ``[N]``, take out of bins ``[N, M]``.
+    """Return the items that flat actions, int64 ``[N]``, take out of bins ``[N, M]``.
 
     Returns:
-        the number of the item in its bin, int64 ``[N]``; the item, ``[N]``; and bool ``[N, P]``, as of
-        :func:`blocked_picks`.
+        the number of the item in its bin, int64 ``[N]``; the item, ``[N]``; and its blocked picks, bool ``[N, P]``,
+        see :func:`blocked_picks`.
     """
     blocked = blocked_picks(cell, items)
     if blocked is None:
@@ -63,7 +63,7 @@ def take_item(cell: CellSpec, items: Item, action: Tensor) -> tuple[Tensor, Item
 def taken_item(cell: CellSpec, items: Item, x: Tensor, y: Tensor) -> Tensor:
     """Return the number of the item that picks at cells ``(x, y)`` take, int64 ``[N]``: the highest that is gripped.
 
-    Of equals the first, and 0 if none is gripped; such picks fail.
+    Ties go to the first item. The number is 0 if no item is gripped; such picks fail.
 
     Args:
         items: ``[N, M]``.
@@ -81,18 +81,18 @@ def select_item(items: Item, number: Tensor) -> Item:
     """Return one item of each bin, ``[N]``; ``number`` is int64 ``[N]``."""
     if items.x.shape[1] == 1:
         return items.flatten()
-    count = number.shape[0]  # not len(), of which torch.export would make a constant
+    count = number.shape[0]  # not len(), which torch.export would turn into a constant
     return items.rows((torch.arange(count, device=number.device), number))
 
 
 def remove_item(cell: CellSpec, items: Item, number: Tensor, removed: Tensor | None = None) -> Item:
-    """Return what is left in the bins ``[N, M]``; later items move up, so that the first is the oldest.
+    """Return the bins ``[N, M]`` without an item; later items move up, so that the first is the oldest.
 
     Args:
-        cell: with its ``tipping`` an item leaves in all its poses.
+        cell: with ``tipping``, all poses of the item leave.
         items: ``[N, M]``.
-        number: int64 ``[N]``.
-        removed: bool ``[N]``, whether that item is removed at all; None: it is.
+        number: int64 ``[N]``, the item's number in its bin.
+        removed: bool ``[N]``, whether the item is removed; None: it is.
     """
     table = items.table
     if table.shape[1] == 1:
@@ -107,7 +107,7 @@ def remove_item(cell: CellSpec, items: Item, number: Tensor, removed: Tensor | N
 
 
 def must_share(items: Item, rows: Tensor) -> bool:
-    """Return whether any of the bins in ``rows``, bool ``[N]``, holds an item already; all of them have room."""
+    """Return whether any of the bins in ``rows``, bool ``[N]``, already holds an item. All of them must have room."""
     return items.x.shape[1] > 1 and bool((rows & items.exists[:, 0]).any())
 
 
@@ -117,7 +117,7 @@ def add_item(items: Item, item: Item, rows: Tensor) -> Item:
     Args:
         items: ``[N, M]``.
         item: ``[N]``.
-        rows: bool ``[N]``, the bins to which one is added; they have room.
+        rows: bool ``[N]``, the bins to which an item is added; they must have room.
     """
     added, count = rows[:, None], items.x.shape[1]
     if count > 1:
@@ -126,13 +126,13 @@ def add_item(items: Item, item: Item, rows: Tensor) -> Item:
 
 
 def find_room(cell: CellSpec, item: Item, others: Item, keeps_place: Tensor, uniform: Tensor) -> Item:
-    """Return an item at a place where it overlaps no other, ``[N]``; of size 0 if there is none.
+    """Return items at places where they overlap no other, ``[N]``; of size 0 where there is no such place.
 
     Args:
         item: ``[N]``.
         others: ``[N, M]``.
-        keeps_place: bool ``[N]``, whether only its own place counts.
-        uniform: float64 ``[N]``, decides among the places.
+        keeps_place: bool ``[N]``, whether an item may lie only at its own place.
+        uniform: float64 ``[N]``, in [0, 1), selects one of the free places.
     """
     (bin_w, bin_d), count = cell.bin_size[:2], len(item.x)
     x, y = (torch.arange(side, device=item.x.device) for side in (bin_w, bin_d))
@@ -153,12 +153,12 @@ def find_room(cell: CellSpec, item: Item, others: Item, keeps_place: Tensor, uni
 
 
 def may_arrive(cell: CellSpec, items: Item, differs: Episode) -> Tensor:
-    """Return whether items may arrive in the bins ``[N, M]`` now, bool ``[N]``: with ``refill="batch"`` in empty ones.
+    """Return whether items may arrive in the bins ``[N, M]`` now, bool ``[N]``; a batch only in empty bins.
 
     Args:
         cell: has the refill rule, unless episodes differ in it.
         items: ``[N, M]``.
-        differs: what the episodes differ in.
+        differs: settings in which the episodes differ.
     """
     waits = cell.refill == "batch" if differs.refill is None else differs.refill == REFILLS.index("batch")
     return ~(items.exists[:, 0] & waits)
@@ -177,10 +177,10 @@ def awaits_unseen(cell: CellSpec, state: State) -> Tensor:
 
 
 def let_in(cell: CellSpec, state: State) -> State:
-    """Return the state after the items that are seen have arrived, as far as the bins take them.
+    """Return the state after the items of the preview have arrived, as far as the bins have room.
 
-    An item lies at its own place in a bin that was empty, as in the environment. It lies at the first free place in any
-    other bin, where the environment draws one.
+    In an empty bin an item lies at its own place, as in the environment. In any other bin it lies at the first free
+    place; the environment draws one at random.
     """
     _, _, items, differs, _, coming = state
     if coming is None:

@@ -1,4 +1,4 @@
-"""The robot cell: every size and option of bin, tote and end effector, stated once and checked once."""
+"""The robot cell: all sizes and options of bin, tote and end effector, and their checks."""
 
 from dataclasses import InitVar, dataclass, field, fields
 from functools import cached_property
@@ -24,7 +24,7 @@ from pickplace.rules.state import REFILLS
 from pickplace.rules.support.rules import Bearing, Support, read_support
 
 MAX_BIN_ITEMS = 100
-POSES = 3  # in which an item may be put down if it may be tipped: one for each pair of its faces
+POSES = 3  # of an item that may be tipped: one for each pair of its faces
 
 MAX_SIDE = 2_000  # greatest side of a grid or height, in cells or height units
 MAX_CELLS, MAX_ACTIONS = 2**16, 2**27  # greatest number of cells of a grid, and of flat actions
@@ -44,30 +44,31 @@ class CellSpec:
         rotations: ``R``, the number of quarter turns to choose from, 1 to 4.
         support: the stability rule, an object of :mod:`pickplace.rules.support.rules`; or a short form of it, the name
             of one of :data:`~pickplace.rules.support.rules.RULES` or the least share of the footprint.
-        height_unit: length of a height unit, in sides of a cell. The rules only count units; what converts heights to
-            lengths (the robot's planner, the replay page) multiplies by it.
+        height_unit: length of a height unit, in sides of a cell. The rules only count units. Code that converts heights
+            to lengths (the robot's planner, the replay page) multiplies by it.
         cell_size: length of a cell, m. The rules only count cells; simulated physics and ``plans.jsonl`` need lengths.
-        reach: of the robot, such as an :class:`~pickplace.rules.reach.annulus.Annulus` or tables of
+        reach: reach of the robot, such as an :class:`~pickplace.rules.reach.annulus.Annulus` or tables of
             :class:`~pickplace.rules.reach.base.Limits`; None: it reaches everything.
-        bin_items: ``M``, how many items a bin holds at most.
-        refill: of several items: a new one arrives after ``"each"`` pick, or a ``"batch"`` when the bin is empty.
-        preview: how many of the next items are seen before they arrive, in their order. What is feasible does not
-            depend on it.
-        handling: whether each item has handling instructions of its own: the greatest load that may lie on it, and the
-            turns that are allowed. The rules then keep count of which items lie on which.
-        tipping: whether items may be put down on another side, too, for cells in which the gripper does not matter. An
-            item then lies in the bin once in each of its three poses, side by side, and takes three of its places; who
-            picks one has taken it. Heights are in cells.
-        longest_side: longest side of any item, where it is known: no item may be longer. It saves time, and unless the
-            gripper limits the items it also sets the number of offsets.
-        most_items: how many items a tote holds at most, where it is known; else there is room for one in each cell and
-            height unit. Used with ``handling`` alone.
-        varies: what episodes may differ in, beside the height of the tote: names of
+        bin_items: ``M``, greatest number of items in a bin.
+        refill: with several items, ``"each"``: a new item arrives after each pick; ``"batch"``: new items arrive when
+            the bin is empty.
+        preview: number of the next items that are seen before they arrive, in their order. It does not change which
+            actions are feasible.
+        handling: whether each item has its own handling instructions: the greatest load that may lie on it, and the
+            turns that are allowed. The rules then record which items lie on which.
+        tipping: whether items may also be put down on another side, for cells in which the gripper does not matter. An
+            item then lies in the bin once in each of its three poses, side by side, and takes three places. A pick of
+            one pose takes the item. Heights are in cells.
+        longest_side: longest side of any item, if known; no item may be longer. It saves time. Unless the gripper
+            limits the size of items, it also sets the number of offsets.
+        most_items: greatest number of items in a tote, if known; else there is room for one in each cell and height
+            unit. Used only with ``handling``.
+        varies: settings in which episodes may differ, besides the height of the tote: names of
             :data:`~pickplace.rules.observation.EPISODE_TERMS`. The observation has an entry for each.
-        item_inset: cells at each edge of the item, along x and y, that a measured item may cover in part only; see
+        item_inset: cells at each edge of the item, along x and y, that a measured item may cover only in part; see
             :meth:`Gripper.is_gripped <pickplace.rules.gripper.base.Gripper.is_gripped>`.
-        effector_size, body, cup, cup_size, pick_rule, min_seal: a short form that makes the gripper, or changes the one
-            that is given: its size, shapes and settings, and its rule by name. Read them from ``gripper``.
+        effector_size, body, cup, cup_size, pick_rule, min_seal: a short form that changes ``gripper``: its size, shapes
+            and settings, and its rule by name. Read the resulting values from ``gripper``.
 
     Raises:
         ValueError: naming the argument, the value received and what was expected.
@@ -124,7 +125,7 @@ class CellSpec:
         or_null(whole_number, "longest_side", self.longest_side)
         or_null(whole_number, "most_items", self.most_items)
         expect(isinstance(self.reach, Reach | None), "reach", self.reach, "a Reach, such as an Annulus, or None")
-        # Each size is possible alone, but these products would fill the memory.
+        # Each size is valid alone, but their products may exceed the memory.
         bin_size, tote_size = f"bin_size={[*self.bin_size]}", f"tote_size={[*self.tote_size]}"
         at_most(f"{bin_size}: the bin has", self.num_picks, "cells", MAX_CELLS)
         at_most(f"{tote_size}: the tote has", self.num_places, "cells", MAX_CELLS)
@@ -158,17 +159,17 @@ class CellSpec:
 
     @property
     def num_footprints(self) -> int:
-        """The number of footprints ``(parity, x, y)``; what an action leaves in the tote is one of them."""
+        """The number of footprints ``(parity, x, y)``; an action leaves the item on one of them."""
         return self.parities * self.num_places
 
     @property
     def num_choices(self) -> int:
-        """The number of pairs of an item in the bin and a footprint, ``item * num_footprints + footprint``."""
+        """The number of choices of an item in the bin and a footprint, ``item * num_footprints + footprint``."""
         return self.bin_items * self.num_footprints
 
     @property
     def poses(self) -> int:
-        """How many of the bin's places an item takes, see ``tipping``."""
+        """The number of places in the bin that an item takes, see ``tipping``."""
         return POSES if self.tipping else 1
 
     @property
@@ -178,12 +179,12 @@ class CellSpec:
 
     @property
     def pile_room(self) -> int:
-        """``L``, how many items a tote has room for, see :class:`~pickplace.rules.pile.Pile`."""
+        """``L``, the number of items that a tote has room for, see :class:`~pickplace.rules.pile.Pile`."""
         return self.most_items or self.tote_volume(self.tote_size[2])
 
     @cached_property
     def limits(self) -> Limits | None:
-        """The limits of the robot on this cell's grids, see :class:`Limits`; None: it has none."""
+        """The limits of the robot on this cell's grids, see :class:`Limits`; None: no limits."""
         return None if self.reach is None else self.reach.limits(self)
 
     @cached_property
@@ -209,7 +210,7 @@ class CellSpec:
 
     @cached_property
     def num_offsets(self) -> int:
-        """``O``: how many offsets there are along one axis."""
+        """``O``, the number of offsets along one axis."""
         return len(self._offsets)
 
     @cached_property
@@ -234,7 +235,7 @@ CELL_SETTINGS = tuple(item.name for item in fields(CellSpec) if not item.metadat
 
 
 def cell_from_settings(settings: dict) -> CellSpec:
-    """Return the cell of settings by name, such as a config's; raises ``ValueError`` for a name that there is not."""
+    """Return the cell with the settings of a config, by name; raise ``ValueError`` for an unknown name."""
     for name, value in settings.items():
         expect(name in signature(CellSpec).parameters, short_text(name), value, f"one of {', '.join(CELL_SETTINGS)}")
     return CellSpec(**settings)

@@ -1,8 +1,8 @@
-"""The checks of an action, in the order of the rules: one list, which the single step, masks and measured totes read.
+"""The checks of an action, in the order of the rules: one list for the single step, masks and measured totes.
 
-A check looks at the facts of a scope: of a pick (a :class:`~pickplace.rules.grasps.Grasp`), of an item at rest on a
-footprint, of the end effector over the tote, or of a rotation. The single step looks at all facts of one action. Masks
-combine the checks of each scope for all picks, all footprints, all places of the end effector, and all rotations.
+A check reads the facts of one scope: a pick (a :class:`~pickplace.rules.grasps.Grasp`), an item at rest on a footprint,
+the end effector over the tote, or a rotation. The single step reads all facts of one action. Masks combine the checks
+of each scope for all picks, all footprints, all places of the end effector, and all rotations.
 """
 
 from collections.abc import Callable
@@ -17,9 +17,9 @@ from torch import Tensor
 from pickplace.rules.maps import NEVER
 from pickplace.rules.state import Failure
 
-#: The scopes. A check of a pick or a footprint is passed or not. One of a place of the end effector says which height
-#: its suction face, which is that of the item's top, must have at least, or at most. The facts of a rotation are
-#: whether it is allowed.
+#: The scopes. A check of a pick, a footprint or a rotation returns whether it is passed. A check of a place of the end
+#: effector returns the least, or the greatest, height of the suction face there, which is the height of the item's top.
+#: The facts of a rotation are whether it is allowed.
 PICK, FOOTPRINT, LEAST_TOP, GREATEST_TOP, TURN = range(5)
 _COMPARE = {LEAST_TOP: torch.ge, GREATEST_TOP: torch.le}
 _COMBINE = {PICK: and_, FOOTPRINT: and_, LEAST_TOP: torch.maximum, GREATEST_TOP: torch.minimum, TURN: and_}
@@ -28,7 +28,7 @@ _COMBINE = {PICK: and_, FOOTPRINT: and_, LEAST_TOP: torch.maximum, GREATEST_TOP:
 class Resting(NamedTuple):
     """Items at rest on footprints."""
 
-    inside: Tensor | None  # whether the footprint is in the tote; None: outside of it the top is above any rim
+    inside: Tensor | None  # whether the footprint is in the tote; None: the top is above any rim outside of it
     top: Tensor  # height of the item's top
     rim: Tensor | int  # height of the tote
     stable: Tensor
@@ -50,8 +50,8 @@ class Over(NamedTuple):
         return Over(self.leaves.flatten()[index], self.rim, self.obstacle.flatten()[index], *limits)
 
 
-#: Why an action may fail, the scope, and a function that returns of the scope's facts whether the check is passed, or
-#: the height; None: there is nothing to check.
+#: The failure, the scope, and a function of the scope's facts that returns whether the check is passed, or the height;
+#: None: there is nothing to check.
 CHECKS: tuple[tuple[Failure, int, Callable[[Any], Tensor | None]], ...] = (
     (Failure.PICK_MISS, PICK, lambda pick: pick.grips),
     (Failure.BIN_COLLISION, PICK, lambda pick: ~pick.collides),
@@ -67,26 +67,26 @@ CHECKS: tuple[tuple[Failure, int, Callable[[Any], Tensor | None]], ...] = (
     (Failure.OVERLOADED, FOOTPRINT, lambda resting: resting.borne),
 )
 
-#: Why an action fails by its pick alone, wherever it places the item: these checks come first.
+#: The failures that the pick alone decides, wherever the item is placed: their checks come first.
 PICK_FAILURES = tuple(kind for kind, scope, _ in takewhile(lambda check: check[1] == PICK, CHECKS))
 
 _FINDS = {scope: [find for _, where, find in CHECKS if where == scope] for scope in _COMBINE}
 
 
 def combine(scope: int, facts: Any) -> Any:
-    """Return whether all checks of a scope are passed, bool; of a height the one that passes all; None: any does."""
+    """Return whether all checks of a scope are passed, bool, or the height that passes all; None: no checks."""
     values = [value for find in _FINDS[scope] if (value := find(facts)) is not None]
     return reduce(_COMBINE[scope], values) if values else None
 
 
 def first_failure(pick: Any, resting: Resting, over: Over, turn: Tensor | None = None) -> Tensor:
-    """Return the failure code of each action by the first check that is not passed, int64; 0 if all are.
+    """Return the failure code of the first check that each action does not pass, int64; 0 if it passes all.
 
-    ``turn`` says whether its rotation is allowed; None: all are.
+    ``turn`` is whether the action's rotation is allowed; None: all are.
     """
     failure = torch.zeros_like(resting.top)
     facts = {PICK: pick, FOOTPRINT: resting, LEAST_TOP: over, GREATEST_TOP: over, TURN: turn}
-    for kind, scope, find in reversed(CHECKS):  # the first has the last word
+    for kind, scope, find in reversed(CHECKS):  # so that the first failed check is written last
         if (value := find(facts[scope])) is not None:
             passed = _COMPARE[scope](resting.top, value) if scope in _COMPARE else value
             failure = torch.where(passed, failure, int(kind))
@@ -94,5 +94,5 @@ def first_failure(pick: Any, resting: Resting, over: Over, turn: Tensor | None =
 
 
 def is_within_reach(lowest: Tensor, highest: Tensor, face: Tensor) -> Tensor:
-    """Return whether the robot may bring the suction face to that height, see the limits of a cell."""
+    """Return whether the height of the suction face is within the robot's limits, see ``CellSpec.limits``."""
     return (lowest <= face) & (face <= highest)

@@ -1,4 +1,4 @@
-"""Why flat actions of one problem fail: the codes of the single step, looked up in maps, for half a million actions."""
+"""Failure codes of flat actions of one problem: those of the single step, from maps, for half a million actions."""
 
 from typing import NamedTuple
 
@@ -30,13 +30,13 @@ class FailureMaps(NamedTuple):
     def of(cls, cell: CellSpec, state: State) -> "FailureMaps":
         """Return the facts of a state of one problem, with items ``[1, M]``."""
         surface, rim, items = state.each_item()
-        # With a rim as high as can be, an item inside the tote has no top only where it is unstable.
+        # With the highest possible rim, the top inside the tote is NEVER only where the item is unstable.
         top, rest = resting_top(cell, surface, torch.full_like(rim, FAR), items)
         over = over_tote(cell, state.surface, state.tote_height)
         return cls(items, blocked_picks(cell, state.items), rest, top != NEVER, state.tote_height, over)
 
     def placing_maps(self, cell: CellSpec) -> PlacingMaps:
-        """Return what :func:`~pickplace.rules.masks.placing_maps` returns for the state."""
+        """Return the same as :func:`~pickplace.rules.masks.placing_maps` for the state."""
         top = self.rest + self.items.h.to(self.rest.dtype)[:, None, None, None]
         good = combine(FOOTPRINT, Resting(None, top, self.rim, self.stable))
         maps = PlacingMaps.of(torch.where(good, top, NEVER), self.rest, self.over, self.items, self.blocked)
@@ -68,14 +68,14 @@ def failure_codes(
     Args:
         cell: with the limits of the robot.
         action: int64 ``[A]``.
-        item: what they take, ``[A]``.
+        item: the items that they take, ``[A]``.
         carried: see :func:`~pickplace.rules.grasps.carry`.
         rest, stable: the height on which an item lies on each footprint, and whether it is stable there,
-            ``[M, Q, W_T, D_T]``; of one item ``[Q, W_T, D_T]``, too.
-        rim: greatest height of its top.
+            ``[M, Q, W_T, D_T]``, or ``[Q, W_T, D_T]`` with one item.
+        rim: greatest height of the item's top.
         over: the end effector over every place cell.
-        number: of the item, int64 ``[A]``, from 0 to ``M - 1``.
-        borne: whether the items below bear it, in the shape of ``stable``; None: they bear any.
+        number: the item's number, int64 ``[A]``, from 0 to ``M - 1``.
+        borne: whether the items below bear the item, in the shape of ``stable``; None: they bear any load.
     """
     (wide, deep, _), (_, _, x_tote, y_tote, _) = cell.tote_size, split_action(cell, action)
     picked, rotation, _, (x, y, w, d) = carried

@@ -1,9 +1,9 @@
 """Picking: which pick cells lift the item, and how it then lies under the turned end effector.
 
-The bin matters for the tote only through the *grasp class*: the turn and the item's offset under the end effector. Many
-pick cells and rotations share one, which keeps the masks over all actions cheap. ``O`` offsets are possible along one
-axis, ``K = O * O`` in all. A turn is a parity, if neither the end effector, nor limits on the robot, nor the item tell
-rotations apart that differ by 180 degrees; else it is a rotation.
+A pick affects the placement only through its *grasp class*: the turn and the item's offset under the end effector. Many
+pick cells and rotations share a class, which keeps the masks over all actions cheap. ``O`` offsets are possible along
+one axis, ``K = O * O`` in all. A turn is a parity if rotations that differ by 180 degrees are equivalent for the end
+effector, the robot's limits and the item. Else it is a rotation.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from pickplace.rules.maps import FAR
 
 
 def is_outside(corner: Tensor, side: Tensor | int, grid: int) -> Tensor:
-    """Return whether something of a length leaves the grid, along one axis."""
+    """Return whether ``side`` cells from ``corner`` on leave the grid, along one axis."""
     return (corner < 0) | (corner > grid - side)
 
 
@@ -42,7 +42,7 @@ def turn(near_x: Tensor, near_y: Tensor, back_x: Tensor, back_y: Tensor) -> tupl
 
 
 class Grasp(NamedTuple):
-    """The effect of a pick on the item; the fields have the common shape of the pick's coordinates and the item."""
+    """The effect of a pick on the item; the fields broadcast to the shape of the pick's coordinates and the item."""
 
     grips: Tensor
     collides: Tensor
@@ -59,10 +59,10 @@ class Grasp(NamedTuple):
 
 
 def grasp(cell: CellSpec, item: Item, x: Tensor, y: Tensor, blocked: Tensor | None = None) -> Grasp:
-    """Return what picks at cells ``(x, y)`` do.
+    """Return the effect of picks at cells ``(x, y)``.
 
     Args:
-        item: parts ``[N]``; the batch is the last axis.
+        item: ``[N]``; the batch is the last axis.
         x, y: tensors that broadcast with ``[..., N]``.
         blocked: bool ``[N, P]``, see :func:`~pickplace.rules.bin.blocked_picks`; None: the item lies alone.
     """
@@ -73,7 +73,7 @@ def grasp(cell: CellSpec, item: Item, x: Tensor, y: Tensor, blocked: Tensor | No
     gripped = cell.gripper.is_gripped(near_x, near_y, item.w, item.d, cell.item_inset)
     # Every edge of the rectangle has a cell of the body.
     leaves_bin = is_outside(left, ee_w, bin_w) | is_outside(front, ee_d, bin_d)
-    # An item is never higher than its own top: just the walls and other items can be hit.
+    # The body is level with the item's top: it can hit only the walls and other items.
     collides = leaves_bin & (item.h < wall)
     reachable = None
     if blocked is not None or cell.limits is not None:
@@ -88,9 +88,9 @@ def grasp(cell: CellSpec, item: Item, x: Tensor, y: Tensor, blocked: Tensor | No
 def carry(
     cell: CellSpec, item: Item, action: Tensor, blocked: Tensor | None = None
 ) -> tuple[Grasp, Tensor, tuple[Tensor, ...], tuple[Tensor, ...]]:
-    """Return where flat actions ``[A]`` bring the items ``[A]``, before anything is checked.
+    """Return where flat actions ``[A]`` bring the items ``[A]``, without any check.
 
-    ``blocked`` is as of :func:`grasp`.
+    For ``blocked`` see :func:`grasp`.
 
     Returns:
         the pick, the rotation, and minimum corner and sides ``(x, y, w, d)`` over the tote of the turned end effector
@@ -142,20 +142,20 @@ def split_footprint(tote_size: Sequence[int], footprint: Tensor) -> tuple[Tensor
     tote_w, tote_d = tote_size[:2]
     line = footprint // tote_d
     parity = line // tote_w
-    return parity, line - parity * tote_w, footprint - line * tote_d  # ONNX has no % of a size that is not a constant
+    return parity, line - parity * tote_w, footprint - line * tote_d  # ONNX has no % by a size that is not a constant
 
 
 def turned_size(item: Item, odd: Tensor) -> tuple[Tensor, Tensor]:
-    """Return width and depth of the item's footprint where it is turned by 90 degrees (``odd``) or not."""
+    """Return width and depth of the item's footprint; ``odd``: whether it is turned by 90 degrees."""
     return torch.where(odd, item.d, item.w), torch.where(odd, item.w, item.d)
 
 
 # ---------------------------------------------------------------------- all picks at once
 def all_grasps(cell: CellSpec, item: Item, blocked: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Return what each pick cell does: whether it lifts the item, bool ``[N, P]``, and the item's offset.
+    """Return for each pick cell whether it lifts the item, bool ``[N, P]``, and the item's offset.
 
     The offset, int64 ``[N, P, R, 2]``, is the item's minimum corner in the frame of the turned end effector.
-    ``blocked`` is as of :func:`grasp`.
+    For ``blocked`` see :func:`grasp`.
     """
     x, y = (torch.arange(side, device=item.x.device)[:, None] for side in cell.bin_size[:2])
     found = grasp(cell, item, x[:, None], y, blocked)  # [W_B, D_B, N]
@@ -168,7 +168,7 @@ def heuristic_pick(cell: CellSpec, item: Item, blocked: Tensor | None = None) ->
     """Return the pick cell of individual planning, which does not look at the tote, int64 ``[N]``.
 
     It has the least offset ``ox + oy``, then ``oy``, among the picks that succeed: the item lies in the end effector's
-    corner where possible. ``blocked`` is as of :func:`grasp`.
+    corner where possible. For ``blocked`` see :func:`grasp`.
     """
     succeeds, offset = all_grasps(cell, item, blocked)
     ox, oy = offset[:, :, 0].unbind(-1)  # before turning, [N, P]
@@ -176,7 +176,7 @@ def heuristic_pick(cell: CellSpec, item: Item, blocked: Tensor | None = None) ->
 
 
 def central_pick(cell: CellSpec, item: Item, blocked: Tensor | None = None) -> Tensor:
-    """Return the pick cell with the middle of the end effector nearest to that of the item, int64 ``[N]``.
+    """Return the pick cell that brings the end effector's middle nearest to the item's middle, int64 ``[N]``.
 
     The distance is the sum along x and y, and ties go to the lowest index. Like :func:`heuristic_pick`, it does not
     look at the tote.
@@ -188,26 +188,27 @@ def central_pick(cell: CellSpec, item: Item, blocked: Tensor | None = None) -> T
     return torch.where(succeeds, away, FAR).argmin(1)
 
 
-#: Picks that do not look at the tote, by the name that a planner's setting has for them.
+#: Picks that do not look at the tote, by their names in a planner's setting.
 PICKS = {"least_offset": heuristic_pick, "middle": central_pick}
 
 
 def select_pick(cell: CellSpec, actions: Tensor, pick: Tensor) -> Tensor:
-    """Return the part of values of all actions ``[N, N_a]`` at the pick cells ``[N]``: ``[N, W_T * D_T * R]``."""
+    """Return the values ``[N, W_T * D_T * R]`` at the pick cells ``[N]``, of those of all actions ``[N, N_a]``."""
     return actions.unflatten(1, (cell.num_picks, -1))[torch.arange(len(pick), device=pick.device), pick]
 
 
 # ---------------------------------------------------------------------- grasp classes
 def num_turns(cell: CellSpec) -> int:
-    """Return how many turns are told apart; a rotation's turn is its remainder.
+    """Return the number of distinct turns; the turn of a rotation is its remainder.
 
-    They are parities; or rotations, where one may be forbidden and not its like, or a half turn changes the body.
+    Turns are rotations if limits may apply to a rotation but not to its half turn, or a half turn changes the body.
+    Else they are parities.
     """
     return num_grasp_turns(cell) if cell.limits is None and not cell.forbids_turns else cell.rotations
 
 
 def num_grasp_turns(cell: CellSpec) -> int:
-    """Return how many turns are told apart without limits."""
+    """Return the number of distinct turns without limits on rotations."""
     return max(cell.parities, len(cell.effectors))
 
 
@@ -228,13 +229,13 @@ def pick_classes(cell: CellSpec, item: Item) -> Tensor:
 
 
 def available_offsets(cell: CellSpec, item: Item, blocked: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Return which offsets a pick can have, and which grasp classes they become by turning.
+    """Return a mask of the offsets that some pick has, and the grasp class of each offset after each rotation.
 
-    ``blocked`` is as of :func:`grasp`.
+    For ``blocked`` see :func:`grasp`.
 
     Returns:
-        bool ``[K, N]``: some pick cell, the only one, lifts the item with this offset under the end effector before
-        turning; int64 ``[R, K, N]``: the class that this offset becomes by each rotation, clamped into range.
+        bool ``[K, N]``, whether the one pick cell that gives the offset before turning lifts the item; int64
+        ``[R, K, N]``, the grasp class of the offset after each rotation, clamped into range.
     """
     (bin_w, bin_d, _), (ee_w, ee_d), count = cell.bin_size, cell.gripper.size, cell.num_offsets
     here = torch.arange(count, device=item.x.device)[:, None]
@@ -254,7 +255,7 @@ def available_offsets(cell: CellSpec, item: Item, blocked: Tensor | None = None)
 
 
 def pick_blocks(cell: CellSpec, item: Item) -> Tensor:
-    """Return the number of each pick cell's offset, int64 ``[N, P]``; ``K`` where the item is not under it at all."""
+    """Return the number of each pick cell's offset, int64 ``[N, P]``; ``K`` if it is out of range."""
     (_, bin_d, _), (ee_w, ee_d), count = cell.bin_size, cell.gripper.size, cell.num_offsets
     number = torch.arange(cell.num_picks, device=item.x.device)
     x = item.x[:, None] - (number // bin_d - reference_cell(ee_w)) - cell.min_offset

@@ -9,7 +9,7 @@ from torch import Tensor
 from pickplace.rules.maps import rectangle
 
 if TYPE_CHECKING:
-    from tensordict import TensorDictBase  # which takes longer to import than all of the rules
+    from tensordict import TensorDictBase  # its import takes longer than that of all the rules
 
 #: An observation ``[N]``: a TensorDict, or a dict of its entries.
 Observation: TypeAlias = "TensorDictBase | Mapping[str, Tensor]"
@@ -40,14 +40,14 @@ class Item(_Columns):
     """Items, column by column: int64 tensors of one shape.
 
     The items in the bins of a :class:`~pickplace.rules.state.State` have columns ``[N, M]``: ``M`` places in each bin,
-    filled in the order of arrival. One item for each of ``N`` problems has columns ``[N]``. An item of size
-    ``(0, 0, 0)`` is not there.
+    filled in the order of arrival. One item for each of ``N`` problems has columns ``[N]``. A size of
+    ``(0, 0, 0)`` stands for no item.
 
     Args:
         x, y: minimum corner in the bin; cells.
         w, d, h: width and depth in cells, height in height units.
-        kind: row of the size in :attr:`~pickplace.items.distributions.ItemDistribution.sizes`; -1: not known.
-        turns: quarter turns that are allowed, bit ``r`` for rotation ``r``.
+        kind: row of the size in :attr:`~pickplace.items.distributions.ItemDistribution.sizes`; -1: unknown.
+        turns: bit mask of the allowed quarter turns, bit ``r`` for rotation ``r``.
         grams: mass.
         max_load: greatest mass that may rest on the item, grams.
     """
@@ -61,7 +61,7 @@ class Item(_Columns):
 
     @classmethod
     def from_table(cls, table: Tensor) -> "Item":
-        """Return the items of a table ``[..., 9]``, as views of it, or ``[..., 5]`` with x, y, w, d and h alone."""
+        """Return the items of a table ``[..., 9]``, as views of it, or ``[..., 5]`` with only x, y, w, d and h."""
         columns = table.unbind(-1)
         if len(columns) < len(cls._fields):
             return cls(*columns)
@@ -103,12 +103,12 @@ class Item(_Columns):
 
 
 def bin_depth_from_items(items: Item, bin_size: Sequence[int]) -> Tensor:
-    """Return the height above the bin's floor, float32 ``[N, W_B, D_B]``: an item's height under it, else 0."""
+    """Return the height above the bin's floor, float32 ``[N, W_B, D_B]``: the height of the item there, or 0."""
     return _bin_map(items, items.h, bin_size)
 
 
 def bin_labels_from_items(items: Item, bin_size: Sequence[int]) -> Tensor:
-    """Return which item of ``[N, M]`` lies on each cell of the bin, float32 ``[N, W_B, D_B]``, from 1; 0: none."""
+    """Return the number of the item on each cell of the bin, float32 ``[N, W_B, D_B]``: 1 to ``M``, 0 where empty."""
     return _bin_map(items, torch.arange(1, items.x.shape[1] + 1, device=items.x.device).expand_as(items.x), bin_size)
 
 
@@ -122,12 +122,12 @@ def _bin_map(items: Item, value: Tensor, bin_size: Sequence[int]) -> Tensor:
 
 
 def read_items(bin_depth: Tensor, table: Tensor | None = None, rotations: Tensor | None = None) -> Item:
-    """Return what lies in the bins, ``[N, M]``: the items of a table, or the one that the depth map shows.
+    """Return the items in the bins, ``[N, M]``, from a table, or the single item that the depth map shows.
 
     Args:
         bin_depth: ``[N, W_B, D_B]``.
-        table: int64 ``[N, M, 5]``, as the observation has it where a bin holds several items.
-        rotations: bool ``[N, R]``, those that are allowed, as the observation has it where episodes forbid some.
+        table: int64 ``[N, M, 5]``, the entry of observations of bins with several items.
+        rotations: bool ``[N, R]``, the allowed ones; the entry of observations of episodes that forbid some.
     """
     items = item_from_depth(bin_depth).rows((slice(None), None)) if table is None else Item.from_table(table)
     if rotations is None:
@@ -136,7 +136,7 @@ def read_items(bin_depth: Tensor, table: Tensor | None = None, rotations: Tensor
 
 
 def items_from_observation(observation: Observation) -> Item:
-    """Return what lies in the bins, ``[N, M]``; see :func:`read_items`."""
+    """Return the items in the bins, ``[N, M]``; see :func:`read_items`."""
     items = read_items(observation["bin_depth"], observation.get("items", None), observation.get("rotations", None))
     handling = observation.get("handling", None)
     return items if handling is None else Item(*items[:6], *handling.unbind(-1))
@@ -145,8 +145,8 @@ def items_from_observation(observation: Observation) -> Item:
 def coming_from_observation(observation: Observation) -> Item | None:
     """Return the items that arrive next, ``[N, p]``, in their order; None where none are shown.
 
-    The table ``coming``, int64 ``[N, p, 5]``, has x, y, w, d and h; or, ``[N, p, 8]``, turns, mass and greatest load,
-    too.
+    The table ``coming``, int64 ``[N, p, 5]``, has x, y, w, d and h. With handling, ``[N, p, 8]``, it also has turns,
+    mass and greatest load.
     """
     if (table := observation.get("coming", None)) is None or table.shape[1] == 0:
         return None
@@ -158,7 +158,7 @@ def coming_from_observation(observation: Observation) -> Item | None:
 
 
 def turns_from_flags(flags: Tensor) -> Tensor:
-    """Return bool ``[..., R]``, whether each rotation is allowed, as bit masks: int64 ``[...]``."""
+    """Return flags of the allowed rotations, bool ``[..., R]``, as bit masks, int64 ``[...]``."""
     return (flags.long() << torch.arange(flags.shape[-1], device=flags.device)).sum(-1)
 
 

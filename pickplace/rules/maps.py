@@ -1,7 +1,7 @@
 """Operations on height maps of many problems.
 
-Maps are kept with the batch last in memory, ``[W, D, N]``: what is done to them is shifting, and then every inner loop
-runs over the problems instead of over a row of a few cells.
+Maps have the batch last in memory, ``[W, D, N]``. Most operations shift maps, and every inner loop then runs over the
+problems instead of over a row of a few cells.
 """
 
 from collections.abc import Sequence
@@ -49,7 +49,7 @@ def square_cells(grid: Sequence[int], x: Tensor, y: Tensor, side: int) -> Tensor
     Args:
         grid: ``(W, D)``.
         x, y: int64 ``[N]``, the square's minimum corner. Cells outside the grid become the nearest cell.
-        side: of the square, in cells.
+        side: side of the square, in cells.
     """
     (wide, deep), step = grid, torch.arange(side, device=x.device)[:, None]
     column, row = (x + step).clamp_(0, wide - 1), (y + step).clamp_(0, deep - 1)  # [side, N]
@@ -57,7 +57,7 @@ def square_cells(grid: Sequence[int], x: Tensor, y: Tensor, side: int) -> Tensor
 
 
 def is_under(w: Tensor, d: Tensor, side: int) -> Tensor:
-    """Return for each cell of a square, row by row, whether a ``w x d`` rectangle at its minimum corner covers it.
+    """Return whether a ``w x d`` rectangle covers each cell of a square with the same minimum corner, row by row.
 
     The result is bool, ``[side * side, *shape of w]``.
     """
@@ -66,18 +66,18 @@ def is_under(w: Tensor, d: Tensor, side: int) -> Tensor:
 
 
 def rectangle_sums(maps: Tensor, w: Tensor, d: Tensor, layer: Tensor | int = 0) -> Tensor:
-    """Return the sum of a map over the ``w x d`` rectangle at each cell; of what is inside the grid.
+    """Return the sum of a map over the part inside the grid of the ``w x d`` rectangle at each cell.
 
     Args:
         maps: whole numbers or bool, ``[L, W, D, N]``.
         w, d: int64, broadcastable to ``[Q, W, D, N]``.
-        layer: int64 ``[Q, W, D, N]``, the index of the map that is meant.
+        layer: int64 ``[Q, W, D, N]``, the index of the map to sum.
 
     Returns:
         int64 ``[Q, W, D, N]``
     """
     layers, wide, deep, batch = maps.shape
-    before = maps.new_zeros(layers, wide + 1, deep + 1, batch, dtype=torch.int64)  # sums of what is before x and y
+    before = maps.new_zeros(layers, wide + 1, deep + 1, batch, dtype=torch.int64)  # sums of the cells before x and y
     before[:, 1:, 1:] = maps.cumsum(1).cumsum(2)
     x, y, number = (torch.arange(size, device=maps.device) for size in (wide, deep, batch))
     x, y = x.view(-1, 1, 1), y.view(-1, 1)

@@ -4,9 +4,9 @@ Symbols used in shapes: ``N`` problems, ``P`` pick cells, ``R`` rotations, ``Q``
 of the item under the end effector, ``T`` turns and ``T * K`` grasp classes (see :mod:`pickplace.rules.grasps`), ``B``
 distinct shapes of the turned end effector (see :attr:`pickplace.rules.cell.CellSpec.effectors`).
 
-Two ideas keep the joint feasibility of all ``N_a = P * W_T * D_T * R`` actions cheap. The bin matters only through the
-grasp class. And the end effector collides if and only if the highest thing under it, the rim counting as a wall around
-the tote, is higher than the item's top: one maximum over its cells decides.
+Two properties make the check of all ``N_a = P * W_T * D_T * R`` actions cheap. The bin matters only through the grasp
+class. And the end effector collides if and only if something under it is higher than the item's top, where the rim is a
+wall around the tote: one maximum over its cells decides.
 """
 
 from collections.abc import Callable
@@ -37,13 +37,13 @@ from pickplace.rules.maps import FAR, NEVER, surround, windows
 from pickplace.rules.placing import over_tote, resting_top
 from pickplace.rules.state import State
 
-CLASS_BYTES = 2**26  # of the masks of grasp classes that are counted at a time
+CLASS_BYTES = 2**26  # of the masks of grasp classes that are counted at once
 
 
 class PlacingMaps(NamedTuple):
     """Everything that decides which actions succeed in a state.
 
-    Where bins hold ``M`` items, there is a problem for each item, those of a bin one after the other: ``N`` is
+    If bins hold ``M`` items, there is a problem for each item, and the items of a bin follow one another: ``N`` is
     ``N * M`` in the shapes of the fields.
     """
 
@@ -54,11 +54,11 @@ class PlacingMaps(NamedTuple):
     blocked: Tensor | None = None  # bool [N, P]: see `blocked_picks`; None: the items lie alone
     bin_items: int = 1  # M
     greatest_top: Tensor | None = None  # int [N, R, W_T, D_T]: greatest top there; None: any
-    level_step: int = 0  # by how much the heights of a level surface may differ, where they are measured
+    level_step: int = 0  # greatest difference of heights on a level surface; above 0 if measured
 
     @classmethod
     def of(cls, top: Tensor, rest: Tensor, over: Over, item: Item, blocked: Tensor | None) -> "PlacingMaps":
-        """Return the maps of items, with the end effector over every place cell of a tote for each bin."""
+        """Return the maps of items; ``over`` has the end effector over every place cell, for each bin's tote."""
         bins, count = over.obstacle.shape[-1], len(top) // over.obstacle.shape[-1]
         bounds = []
         for scope in (LEAST_TOP, GREATEST_TOP):
@@ -68,7 +68,7 @@ class PlacingMaps(NamedTuple):
         return cls(top, bounds[0], item, rest, blocked, count, bounds[1])
 
     def within_turns(self, cell: CellSpec) -> "PlacingMaps":
-        """Return the maps with nothing clear enough in the rotations that the items forbid."""
+        """Return the maps without feasible actions in the rotations that the items forbid."""
         allowed = combine(TURN, flags_from_turns(self.item.turns, cell.rotations))[..., None, None]
         each = self.clearance[:, [turn % self.clearance.shape[1] for turn in range(cell.rotations)]]
         return self._replace(clearance=torch.where(allowed, each, FAR))
@@ -81,7 +81,7 @@ class PlacingMaps(NamedTuple):
         return self._replace(item=self.item.map(function), **changed)
 
     def rows(self, index: Tensor) -> "PlacingMaps":
-        """Return the maps of some bins, by their numbers, which may come up more than once."""
+        """Return the maps of some bins, by their numbers, which may repeat."""
         row = (index[:, None] * self.bin_items + torch.arange(self.bin_items, device=index.device)).flatten()
         return self.map(lambda part: part[row])
 
@@ -113,8 +113,8 @@ def placing_maps(
     """Return everything that decides which actions succeed: see :class:`PlacingMaps`.
 
     Args:
-        find_top: :func:`~pickplace.rules.placing.unchecked_top` for footprints that are known to be stable and below
-            the rim.
+        find_top: :func:`~pickplace.rules.placing.unchecked_top`, if the footprints of interest are known to be stable
+            and below the rim.
     """
     surface, tote_height, item = state.each_item()
     over = over_tote(cell, state.surface, state.tote_height)
@@ -145,7 +145,7 @@ def class_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
 
 
 def check_actions(cell: CellSpec, batch: int, device) -> None:
-    """Refuse to list all flat actions of more problems than the memory holds, with a ``ValueError``."""
+    """Raise ``ValueError`` if the memory cannot hold all flat actions of so many problems."""
     classes = num_turns(cell) * cell.num_offsets**2 * cell.num_places
     check_bytes(
         f"{cell.describe()}: {cell.num_actions:,} actions for {batch} problems at once",
@@ -155,14 +155,14 @@ def check_actions(cell: CellSpec, batch: int, device) -> None:
 
 
 def num_feasible(cell: CellSpec, maps: PlacingMaps) -> Tensor:
-    """Return how many flat actions succeed, int64 ``[N]``, without listing them, or all grasp classes at once."""
+    """Return the number of flat actions that succeed, int64 ``[N]``, without listing actions or all grasp classes."""
     at_once = max(1, CLASS_BYTES // (cell.num_offsets * cell.num_places) // maps.bin_items)
     bins = len(maps.top) // maps.bin_items
     if at_once < bins:
         parts = torch.arange(bins, device=maps.top.device).split(at_once)
         return torch.cat([num_feasible(cell, maps.rows(part)) for part in parts])
     available, classes = available_offsets(cell, maps.item, maps.blocked)
-    counts = []  # of the place cells where placing succeeds, by grasp class
+    counts = []  # numbers of the place cells where placing succeeds, by grasp class
     for number in range(num_turns(cell)):
         clearance = maps.clearance_in(number)
         for top in _tops_by_offset(cell, maps, number):  # with each offset along x
@@ -176,13 +176,13 @@ def num_feasible(cell: CellSpec, maps: PlacingMaps) -> Tensor:
 
 
 def action_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
-    """Return exactly the flat actions that succeed, bool ``[N, N_a]``."""
+    """Return a mask of exactly the flat actions that succeed, bool ``[N, N_a]``."""
     check_actions(cell, len(maps.top), maps.top.device)
     places, batch, rotations = cell.num_places, len(maps.top), cell.rotations
     available, classes = available_offsets(cell, maps.item, maps.blocked)
     by_class = class_mask(cell, maps).permute(2, 0, 1).reshape(-1, places).view(torch.uint8)  # [N * T * K, places]
-    # The flags of all rotations side by side in one number, so that a pick cell's whole block is copied at once:
-    # blocks [N * K + 1, places], of which the last, for picks that fail, is empty.
+    # The flags of all rotations are packed into one number, so that a pick cell's whole block is copied at once. The
+    # last of the blocks [N * K + 1, places] is empty, for picks that fail.
     packed, slots = {1: (torch.uint8, 1), 2: (torch.int16, 2)}.get(rotations, (torch.int32, 4))
     flags = torch.eye(slots, dtype=torch.uint8).view(packed).flatten().tolist()
     count, first = len(available), torch.arange(batch, device=by_class.device)
@@ -200,16 +200,16 @@ def action_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
 
 
 def footprint_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
-    """Return the footprints that some action reaches, bool ``[N, Q, W_T, D_T]`` by parity and minimum corner.
+    """Return a mask of the footprints that some action reaches, bool ``[N, Q, W_T, D_T]`` by parity and min corner.
 
-    Where bins hold several items, for each of them: ``[N * M, Q, W_T, D_T]``; see :func:`choice_mask`.
+    If bins hold several items, there is a mask for each of them, ``[N * M, Q, W_T, D_T]``; see :func:`choice_mask`.
 
     A square footprint is the same in both parities; it is listed under parity 0 only, so that distinct entries leave
     distinct totes.
     """
     batch, count, turns = len(maps.top), cell.num_offsets, num_turns(cell)
     available, classes = available_offsets(cell, maps.item, maps.blocked)
-    # Each class that some pick has; the last row takes what is not available.
+    # Flags of the classes that some pick has; the last row collects the offsets that are not available.
     grasped = available.new_zeros(turns * count**2 + 1, batch)
     grasped.scatter_(0, torch.where(available, classes, len(grasped) - 1).flatten(0, 1), True)
     grasped = grasped[:-1].view(turns, count, count, 1, 1, batch)
@@ -228,21 +228,21 @@ def footprint_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
 
 
 def choice_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
-    """Return the footprints that some action reaches, with any item in the bin: bool ``[N, M * Q * W_T * D_T]``."""
+    """Return a mask of the (item, footprint) choices that some action reaches, bool ``[N, M * Q * W_T * D_T]``."""
     return maps.join(footprint_mask(cell, maps))
 
 
 def corner_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
-    """Return the feasible footprints that occupy a corner, bool ``[N, Q, W_T, D_T]``; some, if any is feasible.
+    """Return a mask of the feasible footprints in corners, bool ``[N, Q, W_T, D_T]``; not empty if any is feasible.
 
-    A footprint occupies a corner if the item there can slide on neither along x nor along y: in one direction of each
-    axis, one step further would raise it, or something would be hit: the tote, or the end effector would hit what is
-    beside the item. Of hundreds of feasible footprints on a fine grid some dozens do. Among them are the
-    bottom-left-stable ones, where both directions are those to the tote's first corner (Zhao, Bennell, Bektas and
-    Dowsland 2016, "A comparative review of 3D container loading algorithms", have both terms).
+    A footprint occupies a corner if the item there is blocked in at least one direction along x and one along y. A
+    direction is blocked if one step further would raise the item, take it out of the tote, or make the end effector hit
+    something. On a fine grid, some dozens of the hundreds of feasible footprints do. Among them are the
+    bottom-left-stable ones, which are blocked in both directions to the tote's first corner (for both terms see Zhao,
+    Bennell, Bektas and Dowsland 2016, "A comparative review of 3D container loading algorithms").
 
-    Where none of them is stable, an unstable footprint a step further counts as blocked, too. Then there is one:
-    whatever is feasible slides on until it is there.
+    If no feasible footprint occupies a corner, a direction is also blocked if one step further is infeasible. Then one
+    exists: any feasible item slides on until it is blocked.
 
     Args:
         cell: the sizes.
@@ -258,7 +258,7 @@ def corner_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
 
 
 def _in_corner(maps: PlacingMaps, free: Tensor) -> Tensor:
-    """Return where a step along x and one along y would raise the item, or end on a footprint that is not free."""
+    """Return a mask of footprints that are blocked along x and y: the next one is not free, or raises the item."""
     rest, level = maps.rest, maps.rest + maps.level_step
     before_x, after_x, before_y, after_y = (
         (_neighbours(rest, axis, step, FAR) > level) | ~_neighbours(free, axis, step, False)
@@ -269,7 +269,7 @@ def _in_corner(maps: PlacingMaps, free: Tensor) -> Tensor:
 
 
 def _neighbours(maps: Tensor, axis: int, step: int, beyond) -> Tensor:
-    """Return for each footprint the value of the one a step further along an axis; ``beyond`` outside the grid."""
+    """Return the value of each footprint's neighbour, a step further along an axis; ``beyond`` outside the grid."""
     moved = maps.roll(-step, axis)
     moved.select(axis, -1 if step > 0 else 0).fill_(beyond)
     return moved
@@ -296,9 +296,9 @@ def _least_clearance(cell: CellSpec, maps: PlacingMaps, parity: int, grasped: Te
     margins = _footprint_margins(cell, parity)
     least = []
     for turn in range(parity, len(grasped), 2):
-        clear, kinds = surround(maps.clearance_in(turn), margins, FAR), grasped[turn].flip(0, 1)  # as the windows are
+        clear, kinds = surround(maps.clearance_in(turn), margins, FAR), grasped[turn].flip(0, 1)  # in windows' order
         if count > 3 and torch.equal(kinds, (in_x := kinds.any(1))[:, None] & (in_y := kinds.any(0))):
-            # The offsets are mostly all pairs of some along x and y. Then the least is one along x, then along y.
+            # Mostly, the offsets are all pairs of an x and a y of two sets. Then reduce along x, then along y.
             near, far = _far_unless(in_x), _far_unless(in_y)
             along = reduce(torch.minimum, (torch.maximum(clear[i : i + tote_w], near[i]) for i in range(count)))
             usable = (torch.maximum(along[:, j : j + tote_d], far[j]) for j in range(count))
@@ -310,22 +310,22 @@ def _least_clearance(cell: CellSpec, maps: PlacingMaps, parity: int, grasped: Te
 
 
 def _far_unless(used: Tensor) -> Tensor:
-    """Return FAR without a flag, else what no clearance is below: a maximum is faster than a choice by the flag."""
+    """Return FAR without a flag, else NEVER, which is below any clearance; torch.maximum is faster than torch.where."""
     return torch.where(used, NEVER, FAR).int()
 
 
 def _reached_within_limits(
     cell: CellSpec, maps: PlacingMaps, greatest_top: Tensor, parity: int, grasped: Tensor
 ) -> Tensor:
-    """Return the footprints that some grasp of this parity reaches, bool ``[W_T, D_T, N]``, under the limits."""
+    """Return a mask of the footprints that some grasp of a parity reaches within the limits, bool ``[W_T, D_T, N]``."""
     (tote_w, tote_d, _), margins = cell.tote_size, _footprint_margins(cell, parity)
     top = maps.top[:, parity].permute(1, 2, 0)
     reached = torch.zeros_like(top, dtype=torch.bool)
     for rotation in range(parity, cell.rotations, 2):
         clear = surround(maps.clearance_in(rotation), margins, FAR)
         highest = surround(greatest_top[:, rotation].permute(1, 2, 0), margins, NEVER)
-        kinds = grasped[rotation].flip(0, 1)  # as the windows are
-        for i, j in kinds.flatten(2).any(2).nonzero().tolist():  # an item in metres has few: the whole cup lies on it
+        kinds = grasped[rotation].flip(0, 1)  # in windows' order
+        for i, j in kinds.flatten(2).any(2).nonzero().tolist():  # few for an item in metres: the whole cup lies on it
             here = slice(i, i + tote_w), slice(j, j + tote_d)
             reached |= (top >= clear[here]) & (top <= highest[here]) & kinds[i, j]
     return reached
@@ -335,7 +335,7 @@ def actions_reaching(cell: CellSpec, maps: PlacingMaps, footprint: Tensor) -> Te
     """Return all successful flat actions that leave the item in a given footprint.
 
     Args:
-        footprint: int64 ``[N]``, index ``(parity * W_T + x) * D_T + y``; of several items in a bin that of a choice,
+        footprint: int64 ``[N]``, index ``(parity * W_T + x) * D_T + y``; with several items in a bin the choice,
             ``item * num_footprints + footprint``.
 
     Returns:
@@ -363,7 +363,7 @@ def actions_reaching(cell: CellSpec, maps: PlacingMaps, footprint: Tensor) -> Te
 def first_action_reaching(cell: CellSpec, maps: PlacingMaps, footprint: Tensor) -> Tensor:
     """Return the lowest flat action that leaves the item in a footprint, int64 ``[N]``; the last action if none does.
 
-    Args: as :func:`actions_reaching`.
+    For the arguments see :func:`actions_reaching`.
     """
     actions = actions_reaching(cell, maps, footprint)
     return torch.where(actions >= 0, actions, cell.num_actions - 1).amin(1)
@@ -372,13 +372,13 @@ def first_action_reaching(cell: CellSpec, maps: PlacingMaps, footprint: Tensor) 
 def action_footprints(cell: CellSpec, items: Item, blocked: Tensor | None = None) -> Tensor:
     """Return the footprint that each flat action would leave if nothing collided, int64 ``[N, N_a]``.
 
-    It is ``item * num_footprints`` and an index as in :func:`actions_reaching`, with a square footprint under parity 0;
-    -1 where the pick fails or the footprint leaves the tote.
+    The value is ``item * num_footprints + footprint`` as in :func:`actions_reaching`, with square footprints under
+    parity 0; -1 where the pick fails or the footprint leaves the tote.
 
     Args:
         cell: the sizes.
         items: ``[N, M]``.
-        blocked: as of :attr:`PlacingMaps.blocked`; None: by :func:`~pickplace.rules.bin.blocked_picks`.
+        blocked: see :attr:`PlacingMaps.blocked`; None: computed by :func:`~pickplace.rules.bin.blocked_picks`.
     """
     (tote_w, tote_d, _), count = cell.tote_size, items.x.shape[1]
     item, device = items.flatten(), items.x.device

@@ -1,9 +1,9 @@
-"""Placing by measured maps: the rules for a surface that no grid of items made.
+"""Placing by measured maps: the rules for a surface that does not follow the grid.
 
-A measured height is right to within some number of height units, and a cell of the grid need not be level. So the maps
-are finer than the grid: each cell is a square of *patches*, with the least and the greatest height in each. What must
-not be hit counts with its greatest height; what shall support an item, with its least. Footprints, offsets and actions
-stay those of the grid, and every comparison is one of the rules' own.
+A measured height has an error of some height units, and a cell of the grid need not be level. So the maps are finer
+than the grid: each cell is a square of *patches*, with the least and the greatest height in each. An obstacle counts
+with its greatest height, a support with its least. Footprints, offsets and actions are those of the grid, and all
+comparisons are those of the rules.
 """
 
 import math
@@ -24,16 +24,16 @@ from pickplace.rules.placing import OnFootprints, footprint_sizes, over_tote
 from pickplace.rules.state import State, surface_from
 from pickplace.rules.support.contact import Patches
 
-DIRECTIONS = 128  # in which the hull of what supports an item is looked at
+DIRECTIONS = 128  # number of directions in which the hull of what supports an item is tested
 
 
 def level_step(accuracy: int) -> int:
-    """Return by how much two measured heights of a level surface may differ: both errors, and a unit for rounding."""
+    """Return the greatest difference of measured heights of a level surface: two errors, and a unit for rounding."""
     return 2 * accuracy + 1
 
 
 def floor_height(accuracy: int) -> int:
-    """Return the greatest height that the tote's floor may seem to have."""
+    """Return the greatest height that may be measured for the tote's floor."""
     return accuracy + 1
 
 
@@ -42,14 +42,14 @@ class MeasuredTote(NamedTuple):
 
     highest: Tensor  # int32 [k W_T, k D_T]: greatest height of each patch, rounded up
     lowest: Tensor  # int32 [k W_T, k D_T]: least height, rounded down
-    bears: Tensor  # bool [W_T, D_T]: whether a cell bears weight, as plans before have it
-    height: int  # of the rim, rounded down: no item may be higher
-    rim: int  # of the rim, rounded up: the end effector passes over it
+    bears: Tensor  # bool [W_T, D_T]: whether a cell bears weight, after the earlier plans
+    height: int  # height of the rim, rounded down: no item may be higher
+    rim: int  # height of the rim, rounded up: the end effector passes over it
     accuracy: int  # greatest error of a height
     placement_error: float  # greatest distance of an item from where a plan sets it down, in cells
 
     def state(self, cell: CellSpec, item: Item, slack: int = 0) -> State:
-        """Return the state on the grid, with the greatest height of each cell; all lower by ``slack``."""
+        """Return the state on the grid, with the greatest height of each cell; all heights lowered by ``slack``."""
         patches = self.highest.shape[0] // cell.tote_size[0]
         heights = self.highest.unflatten(0, (-1, patches)).unflatten(2, (-1, patches)).amax((1, 3))
         height = torch.tensor([self.height - slack], device=heights.device)
@@ -64,7 +64,7 @@ class MeasuredMaps(NamedTuple):
     stable: Tensor  # bool [Q, W_T, D_T]
     highest_top: int  # greatest top that does not pass the rim
     over: Over  # the end effector over every place cell
-    borne: Tensor | None = None  # bool [Q, W_T, D_T]: whether what lies below bears the item; None: it bears any
+    borne: Tensor | None = None  # bool [Q, W_T, D_T]: whether the items below bear the item; None: any load
 
 
 def measured_maps(
@@ -72,14 +72,14 @@ def measured_maps(
 ) -> MeasuredMaps:
     """Return everything that decides which actions succeed in a measured tote.
 
-    An item may be ``accuracy`` higher than measured, and so may what it rests on. So it is released twice that above
-    its top, and the end effector is there when it must clear what is beside the item.
+    An item may be ``accuracy`` higher than measured, and so may what it rests on. So the end effector releases it with
+    the suction face twice that above its top, and from there it must clear what is beside the item.
 
     Args:
         cell: the sizes; heights are in small units, such as millimetres.
         item: of one problem; its width and depth in whole cells, rounded up.
-        sides: its width and depth, in cells, as measured.
-        loads: on what lies in the tote; None: it bears any.
+        sides: the item's width and depth, in cells, as measured.
+        loads: loads on the items in the tote; None: they bear any.
     """
     slack = tote.accuracy
     z = OnFootprints(cell, tote.state(cell, item).surface, *footprint_sizes(cell, item)).z[..., 0]  # [Q, W_T, D_T]
@@ -88,7 +88,7 @@ def measured_maps(
     if loads is not None:
         parts = [_is_borne(item, sides, parity, z[parity], loads) for parity in range(cell.parities)]
         borne = torch.stack(parts)
-    if int(item.w) == int(item.d):  # one footprint to the masks, whichever way the item lies in it
+    if int(item.w) == int(item.d):  # the masks have one footprint for both parities
         stable = stable.all(0).expand_as(stable)
         borne = None if borne is None else borne.all(0).expand_as(borne)
     top, highest = z + item.h.to(z.dtype), tote.height - 2 * slack
@@ -101,7 +101,7 @@ def measured_maps(
 def _contact(
     cell: CellSpec, tote: MeasuredTote, footprint: tuple[int, int], sides: tuple[float, float], z: Tensor
 ) -> Patches:
-    """Return what supports an item of ``sides`` in the middle of footprints ``[W, D]`` that rest on heights ``z``."""
+    """Return the patches that support an item of ``sides``, in the middle of footprints ``[W, D]`` at heights ``z``."""
     count, shape, device = tote.highest.shape[0] // cell.tote_size[0], tuple(z.shape), z.device
     error, sizes = tote.placement_error * count, list(zip(footprint, sides, strict=True))
     spans = [
@@ -129,7 +129,7 @@ def _contact(
         torch.stack([edge + error - part, part + 1 - (size * count - edge - error)]).clamp(0, 1).round(decimals=6)
         for part, edge, size in zip(near, edges, footprint, strict=True)
     ]
-    # Of each half of a side, the part that the item covers whatever the shift must hold a whole patch.
+    # In each half of a side, the part that the item covers whatever the error must contain a whole patch.
     quartered = all(
         math.ceil(size * count / 2 + error - 1e-6) < math.floor((size + side) / 2 * count - error + 1e-6)
         for size, side in sizes
@@ -154,7 +154,7 @@ def _oriented(item: Item, sides: tuple[float, float], parity: int) -> tuple[tupl
 
 
 def _inside(z: Tensor, footprint: tuple[int, int]) -> tuple[slice, slice]:
-    """Return where a footprint of these sides is inside the tote, of all its places ``[W_T, D_T]``."""
+    """Return the range, in ``[W_T, D_T]``, of places at which a footprint of these sides is inside the tote."""
     wide, deep = (max(0, size - side + 1) for size, side in zip(z.shape, footprint, strict=True))
     return slice(0, wide), slice(0, deep)
 
@@ -177,7 +177,7 @@ def _is_stable(
 
 
 def _is_borne(item: Item, sides: tuple[float, float], parity: int, z: Tensor, loads: MeasuredLoads) -> Tensor:
-    """Return whether what lies below bears the item on every footprint of a parity, bool ``[W_T, D_T]``."""
+    """Return whether the items below bear the item on every footprint of a parity, bool ``[W_T, D_T]``."""
     footprint, _ = _oriented(item, sides, parity)
     borne = torch.zeros_like(z, dtype=torch.bool)
     inside = _inside(z, footprint)
@@ -189,7 +189,7 @@ def _is_borne(item: Item, sides: tuple[float, float], parity: int, z: Tensor, lo
 def bearing_after(
     cell: CellSpec, tote: MeasuredTote, item: Item, sides: tuple[float, float], maps: MeasuredMaps, footprint: int
 ) -> Tensor:
-    """Return where the tote bears weight once the item lies on a footprint, bool ``[W_T, D_T]``.
+    """Return a mask of the cells that bear weight once the item lies on a footprint, bool ``[W_T, D_T]``.
 
     Args:
         footprint: index ``(parity * W_T + x) * D_T + y``.
@@ -205,7 +205,7 @@ def bearing_after(
     held = torch.ones_like(flags)
     if not flags.all() and int(z) > floor_height(tote.accuracy):
         held = contact.in_hull()
-    # A cell bears weight if all patches of it that are under the item do; one value a cell must cover it.
+    # A cell bears weight if all of its patches under the item do. With one patch a cell, the item must cover it.
     bears = torch.zeros(size, dtype=torch.bool, device=flags.device)
     bears.view(-1).index_fill_(0, contact.cells, True).index_fill_(0, contact.cells[~held], False)
     after = tote.bears.clone()

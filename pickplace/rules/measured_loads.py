@@ -1,23 +1,23 @@
-"""Loads on items that were measured: which of them carry a new one, and whether they may."""
+"""Loads on measured items: which of them carry a new item, and whether they bear it."""
 
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-ROUNDING = 1e-6  # of a cell: two that only touch share no ground
-UNKNOWN_MASS = 2**40  # grams: more than any limit, and so few of them as lie in a tote are less than ANY_LOAD
+ROUNDING = 1e-6  # cells: intervals that only touch do not overlap
+UNKNOWN_MASS = 2**40  # grams: above any limit; the sum over a tote stays below ANY_LOAD
 ANY_LOAD = 2**60
 
 
 class MeasuredLoads(NamedTuple):
-    """What lies in a tote, and how much each item still bears; ``B`` items. Heights are in height units."""
+    """The ``B`` items in a tote, and the load that each still bears. Heights are in height units."""
 
-    bounds: Tensor  # float64 [B, 4]: least and greatest x, least and greatest y that it may cover; cells
-    tops: Tensor  # int64 [B]: height of its top
-    capacity: Tensor  # int64 [B]: greatest mass on top of it, at which it and all below it are not overloaded; grams
-    unknown: Tensor  # int64 [k W_T, k D_T]: greatest height of each patch that none of them explains; else -1
-    step: int  # by how much two heights that are the same may differ
+    bounds: Tensor  # float64 [B, 4]: least and greatest x, least and greatest y that the item may cover; cells
+    tops: Tensor  # int64 [B]: height of the item's top
+    capacity: Tensor  # int64 [B]: greatest mass on top that overloads neither it nor an item below; grams
+    unknown: Tensor  # int64 [k W_T, k D_T]: greatest height of each patch that no item explains; else -1
+    step: int  # greatest difference of two measurements of the same height
 
     @classmethod
     def of(
@@ -26,8 +26,8 @@ class MeasuredLoads(NamedTuple):
         """Return the loads of items that lie on one another: the full mass of an item counts on each one below it.
 
         Args:
-            bounds, tops, step: as of the result; at most ``step`` high is the floor, too.
-            grams, max_load: int64 ``[B]``, as of an :class:`~pickplace.rules.item.Item`.
+            bounds, tops, step: see the fields. What is at most ``step`` high is the floor.
+            grams, max_load: int64 ``[B]``, see :class:`~pickplace.rules.item.Item`.
             highest: int32 ``[k W_T, k D_T]``, greatest height of each patch.
             per_cell: ``k``, patches along the side of a cell.
         """
@@ -40,29 +40,29 @@ class MeasuredLoads(NamedTuple):
         if not len(tops):
             return cls(bounds, tops, max_load, unknown, step)
         below = _meet(bounds[:, :2], bounds[:, :2]) & _meet(bounds[:, 2:], bounds[:, 2:])
-        # Whatever is lower may carry it: its underside is not known.
+        # Any lower item may carry it: its underside is unknown.
         below &= tops[:, None] > tops  # [B, B]: the second may lie below the first
-        for middle in tops.argsort().tolist():  # what lies on an item lies on all that is below it, too
+        for middle in tops.argsort().tolist():  # what lies on an item also lies on all items below it
             below |= below[:, middle, None] & below[middle]
         spare = max_load - torch.where(below, grams[:, None], 0).sum(0)
         held = torch.where(below | torch.eye(len(tops), dtype=torch.bool, device=tops.device), spare, ANY_LOAD)
         return cls(bounds, tops, held.amin(1).clamp(min=0), unknown, step)
 
     def bear(self, grams: int, footprint: tuple[int, int], z: Tensor) -> Tensor:
-        """Return whether what lies below bears a new item wherever it comes to lie, bool in the shape of ``z``.
+        """Return whether the items below bear a new item on each footprint, bool in the shape of ``z``.
 
-        What is not the floor and not known bears nothing.
+        A surface that is neither the floor nor a known item bears nothing.
 
         Args:
-            grams: its mass.
-            footprint: its sides in whole cells; it does not leave them, whatever its error.
+            grams: the new item's mass.
+            footprint: its sides in whole cells, which it does not leave, whatever its error.
             z: height on which it lies on each footprint inside the tote, ``[X, Y]``.
         """
         x, y = (
             _span(torch.arange(count, device=z.device), side) for count, side in zip(z.shape, footprint, strict=True)
         )
         in_x, in_y = _meet(x, self.bounds[:, :2]), _meet(y, self.bounds[:, 2:])  # [X, B], [Y, B]
-        # A recorded top may differ from what is measured there, and that from the height on which the item lies.
+        # A recorded top may differ from the measured one, and this from the height on which the item lies.
         carries = in_x[:, None] & in_y & ((z[..., None] - self.tops).abs() <= 2 * self.step)
         enough = (torch.where(carries, self.capacity, ANY_LOAD) >= grams).all(2)
         count = self.unknown.shape[0] // (len(z) + footprint[0] - 1)  # patches along a cell
@@ -72,10 +72,10 @@ class MeasuredLoads(NamedTuple):
 
 
 def _span(begin: Tensor, length: float) -> Tensor:
-    """Return intervals ``[K, 2]``."""
+    """Return intervals of one length, float64 ``[K, 2]``, from where they begin, ``[K]``."""
     return torch.stack([begin, begin + length], 1).double()
 
 
 def _meet(one: Tensor, other: Tensor) -> Tensor:
-    """Return which of some intervals ``[K, 2]`` meet others ``[L, 2]``, bool ``[K, L]``."""
+    """Return whether each of some intervals ``[K, 2]`` overlaps each of others ``[L, 2]``, bool ``[K, L]``."""
     return (one[:, None, 0] < other[:, 1] - ROUNDING) & (one[:, None, 1] > other[:, 0] + ROUNDING)

@@ -1,6 +1,6 @@
 """Observations: lists of terms. A new channel is one term, and one line in the config of the environment.
 
-The environment, Gymnasium, the robot's planner and search all ask this list; policies and critics read the entries that
+The environment, Gymnasium, the robot's planner and search use the same list. Policies and critics read the entries that
 they name in ``in_keys``.
 """
 
@@ -17,7 +17,7 @@ from pickplace.rules.item import NO_LIMIT, Item, bin_depth_from_items, bin_label
 from pickplace.rules.state import State
 
 PAPER_CELL = CellSpec()
-MAX_NUMBER = 2**31 - 1  # of a whole number in which episodes differ
+MAX_NUMBER = 2**31 - 1  # greatest value of an :class:`EpisodeNumber`
 
 
 class Bounds(NamedTuple):
@@ -30,7 +30,7 @@ class Bounds(NamedTuple):
 
 
 class Term(ABC):
-    """One entry of the observation; the name under which it is listed is its key."""
+    """One entry of the observation; its key is its name in the list of terms."""
 
     @abstractmethod
     def bounds(self, cell: CellSpec, tallest: int) -> Bounds:
@@ -43,7 +43,7 @@ class Term(ABC):
 
     @abstractmethod
     def value(self, cell: CellSpec, state: State) -> Tensor:
-        """Return this entry for the states of ``N`` problems, ``[N, *shape]``, in a tensor of its own."""
+        """Return this entry for the states of ``N`` problems, ``[N, *shape]``, in a new tensor."""
 
 
 class BinDepth(Term):
@@ -86,7 +86,7 @@ class Coming(Term):
     """The items that arrive next, in their order, int64 ``[N, p, 5]``: x, y, w, d in cells, h in height units.
 
     A row of zeros stands for no item: the stream is over. An item lies at x, y if it comes into an empty bin. In cells
-    with ``handling`` the turns, the mass and the greatest load follow, as of :class:`Handling`: ``[N, p, 8]``.
+    with ``handling`` the turns, the mass and the greatest load follow, as in :class:`Handling`: ``[N, p, 8]``.
     """
 
     def bounds(self, cell, tallest):
@@ -94,7 +94,7 @@ class Coming(Term):
         return Bounds(0, high, (cell.preview, 8 if cell.handling else 5), torch.int64)
 
     def value(self, cell, state):
-        if state.coming is None:  # of a robot's scene that shows none
+        if state.coming is None:  # a robot's scene that shows no coming items
             return state.tote_height.new_zeros(len(state.tote_height), 0, 8 if cell.handling else 5)
         return torch.stack([*state.coming[:5], *(state.coming[6:] if cell.handling else ())], -1)
 
@@ -110,10 +110,10 @@ class SeenItems(Term):
 
 
 class Handling(Term):
-    """Handling instructions of the items in the bin, int64 ``[N, M, 3]``, in the order in which they arrived: the turns
-    that are allowed, as a bit mask, the mass, and the greatest load on top of it, grams.
+    """Handling instructions of the items in the bin, int64 ``[N, M, 3]``, in the order in which they arrived.
 
-    A row of zeros stands for no item. See :class:`~pickplace.rules.item.Item`.
+    The columns are a bit mask of the allowed turns, the mass, and the greatest load on top, both in grams. A row of
+    zeros stands for no item. See :class:`~pickplace.rules.item.Item`.
     """
 
     def bounds(self, cell, tallest):
@@ -148,10 +148,10 @@ class PilePart(Term):
 class ToteCapacity(Term):
     """The greatest load that each cell of the tote still bears, float32 ``[N, W_T, D_T]``, in kg; at most ``most``.
 
-    For networks; in cells with ``handling``.
+    An input for networks, in cells with ``handling``.
 
     Args:
-        most: greater loads look alike.
+        most: greatest value, kg; greater loads look alike.
     """
 
     def __init__(self, most: float = 100.0):
@@ -196,7 +196,7 @@ class ToteHeight(Term):
 
 
 class Rotations(Term):
-    """Which rotations the episode allows, bool ``[N, R]``."""
+    """Mask of the rotations that the episode allows, bool ``[N, R]``."""
 
     def bounds(self, cell, tallest):
         return Bounds(0, 1, (cell.rotations,), torch.bool)
@@ -222,13 +222,13 @@ class EpisodeNumber(Term):
         return getattr(state.episode, self.key)[:, None].clone()
 
 
-#: Entries for what episodes may differ in, in environments that let it vary.
+#: Entries for the settings in which episodes may differ, in environments that let them vary.
 EPISODE_TERMS: Mapping[str, Term] = {
     "rotations": Rotations(),
     **{key: EpisodeNumber(key) for key in ("item_mix", "bin_items", "refill", "preview", "level")},
 }
 
-#: What every observation holds; the whole state can be read from it, see :meth:`State.from_observation`.
+#: Entries of every observation; the whole state can be read from them, see :meth:`State.from_observation`.
 STANDARD_TERMS: Mapping[str, Term] = {
     "bin_depth": BinDepth(),
     "tote_depth": ToteDepth(),
@@ -236,7 +236,7 @@ STANDARD_TERMS: Mapping[str, Term] = {
     "tote_height": ToteHeight(),
 }
 
-#: What an observation holds in cells with ``handling``, beside that.
+#: Further entries of every observation in cells with ``handling``.
 HANDLING_TERMS: Mapping[str, Term] = {
     "handling": Handling(),
     "tote_labels": PilePart("labels"),
@@ -282,12 +282,12 @@ def standard_terms(cell: CellSpec) -> dict[str, Term]:
 
 
 def item_keys(bin_items: int) -> tuple[str, ...]:
-    """Return the entries of such an observation that list the items; one item is in the depth map."""
+    """Return the keys of the entries that list the items; none for one item, which the depth map shows."""
     return ("items",) if bin_items > 1 else ()
 
 
 def seen_items(items: Item, coming: Item | None) -> Tensor:
-    """Return the items in the bins, ``[N, M]``, and those that arrive next, ``[N, p]``, as of :class:`SeenItems`."""
+    """Return the items in the bins, ``[N, M]``, and those that arrive next, ``[N, p]``, see :class:`SeenItems`."""
     return items.cuboids if coming is None else torch.cat([items.cuboids, coming.cuboids], 1)
 
 
@@ -299,8 +299,8 @@ def check_terms(terms: Mapping[str, Term] | None, cell: CellSpec = PAPER_CELL) -
         cell: decides which are standard.
 
     Raises:
-        ValueError: naming the key, for something else than a term, a key that is taken, or another term for a standard
-            one.
+        ValueError: naming the key, for a value that is no term, a key that is taken, or another term in place of a
+            standard one.
     """
     standard, given = standard_terms(cell), {} if terms is None else terms
     expect(isinstance(given, Mapping), "observation", terms, "terms by their keys")
@@ -321,7 +321,7 @@ def check_terms(terms: Mapping[str, Term] | None, cell: CellSpec = PAPER_CELL) -
 def observe(
     terms: Mapping[str, Term], cell: CellSpec, state: State, keys: Collection[str] | None = None
 ) -> dict[str, Tensor]:
-    """Return what an agent sees in the states of ``N`` problems: each entry, ``[N, ...]``, by its key.
+    """Return the observation of the states of ``N`` problems: each entry, ``[N, ...]``, by its key.
 
     Args:
         terms: the entries by key.

@@ -1,8 +1,8 @@
 """Piles: which items of a tote lie on which, and what each of them may still bear.
 
-An item rests on those that it touches from above: those on top of the cells under it that are as high as its underside.
-The *pile below* it are these items and what they rest on, down to the floor. The full mass of an item counts on each
-item of the pile below it: how several of them share it is not known, and none may be asked for more than it bears.
+An item rests on the items that it touches from above: the top items of the cells under it that are as high as its
+underside. The *pile below* it are these items and all that they rest on, down to the floor. The full mass of an item
+counts on each item of the pile below it: how they share it is unknown, and none may be overloaded.
 """
 
 from collections.abc import Sequence
@@ -23,12 +23,12 @@ class Pile(NamedTuple):
 
     @classmethod
     def empty(cls, batch: int, grid: Sequence[int], room: int, device=None) -> "Pile":
-        """Return the piles of empty totes with a grid ``(W_T, D_T)``, with room for some number of items."""
+        """Return the piles of empty totes with a grid ``(W_T, D_T)`` and room for ``room`` items."""
         labels = torch.zeros(batch, *grid[:2], dtype=torch.int64, device=device)
         return cls(labels, labels.new_zeros(batch, room), labels.new_zeros(batch, room, room, dtype=torch.bool))
 
     def rows(self, index) -> "Pile":
-        """Return those of some problems, by their numbers, which may come up more than once."""
+        """Return the piles of some problems, by their numbers, which may repeat."""
         return Pile(*(part[index] for part in self))
 
     @property
@@ -38,7 +38,7 @@ class Pile(NamedTuple):
 
     @property
     def capacity(self) -> Tensor:
-        """The greatest mass that each cell bears, grams, int64 ``[N, W_T, D_T]``: no item below it is then overloaded.
+        """The greatest mass on each cell that overloads no item below it, grams, int64 ``[N, W_T, D_T]``.
 
         -1 everywhere in a tote that has no room for another item.
         """
@@ -53,8 +53,8 @@ class Pile(NamedTuple):
         Args:
             item: ``[N]``.
             index: int64 ``[S * S, N]``, flat cells of the tote, some of which the item rests on.
-            touched: bool ``[S * S, N]``, whether it does.
-            inside: bool ``[N, W_T, D_T]``, the cells that it covers; none where no item is added.
+            touched: bool ``[S * S, N]``, whether the item rests on each of them.
+            inside: bool ``[N, W_T, D_T]``, the cells that the item covers; none if no item is added.
         """
         number, added = self.num_items[:, None], inside.flatten(1).any(1)[:, None]
         own = (torch.arange(self.spare.shape[1], device=number.device) == number) & added  # [N, L]

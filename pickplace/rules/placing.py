@@ -19,21 +19,21 @@ from pickplace.rules.maps import FAR, NEVER, is_under, rectangle_sums, surround,
 from pickplace.rules.state import surface_from
 from pickplace.rules.support.contact import Contact
 
-LEAST_SIDE = 8  # of the square under an item; from there on :class:`LargeItems` is faster
-MAX_LEVELS = 2**22  # entries of its tables; more problems are looked at in turn
-FOOTPRINTS_AT_ONCE = {"cpu": 2**17, "cuda": 2**24}  # what a CPU's caches hold; 100 bytes each on a GPU
+LEAST_SIDE = 8  # side of the square under an item from which :class:`LargeItems` is faster
+MAX_LEVELS = 2**22  # entries of its tables; further problems follow in turn
+FOOTPRINTS_AT_ONCE = {"cpu": 2**17, "cuda": 2**24}  # as many as a CPU's caches hold; 100 bytes each on a GPU
 
 
 def resting_top(
     cell: CellSpec, surface: Tensor, tote_height: Tensor, item: Item, capacity: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Return the height of the item's top for every footprint, and what it rests on; int32 ``[N, Q, W_T, D_T]`` each.
+    """Return the height of the item's top on every footprint, and of its underside, int32 ``[N, Q, W_T, D_T]`` each.
 
-    Arguments as of :meth:`~pickplace.rules.state.State.each_item` and :attr:`~pickplace.rules.state.State.capacity`.
+    Arguments: see :meth:`~pickplace.rules.state.State.each_item` and :attr:`~pickplace.rules.state.State.capacity`.
 
     The top is ``NEVER`` where the item cannot rest: the footprint leaves the tote, the top passes the rim, the support
-    is too small, or something below would be overloaded. The height below it is that on which it would lie, stable or
-    not; ``FAR`` outside the tote.
+    is too small, or something below would be overloaded. The underside is given whether the item is stable or not, and
+    ``FAR`` outside the tote.
     """
     w, d = footprint_sizes(cell, item)
     at_once = max(1, FOOTPRINTS_AT_ONCE.get(surface.device.type, 2**24) // cell.num_footprints)
@@ -56,7 +56,7 @@ def resting_top(
 def unchecked_top(
     cell: CellSpec, surface: Tensor, tote_height: Tensor, item: Item, capacity: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Return the same as :func:`resting_top`, but for every footprint in the tote, stable and borne or not."""
+    """Return the same as :func:`resting_top`, but the top of every footprint in the tote, without any check."""
     z = OnFootprints(cell, surface, *footprint_sizes(cell, item)).z
     return (z + item.h.to(z.dtype)).permute(3, 0, 1, 2), z.permute(3, 0, 1, 2)
 
@@ -74,7 +74,7 @@ class OnFootprints(Contact):
 
     Args:
         surface: int32 ``[N, W_T, D_T]``.
-        w, d: as of :func:`footprint_sizes`.
+        w, d: see :func:`footprint_sizes`.
     """
 
     def __init__(self, cell: CellSpec, surface: Tensor, w: Tensor, d: Tensor):
@@ -85,18 +85,18 @@ class OnFootprints(Contact):
         self.supporting = surface_from(self.z)
 
     def _highest(self, maps: Tensor, axis: int, size: Tensor) -> Tensor:
-        """Return the maximum over the footprints' sides along an axis, from each cell on but the last ``side - 1``."""
+        """Return the maximum over a footprint's side along an axis, from each cell on except the last ``side - 1``."""
         step, count = torch.arange(self.side, device=size.device), maps.shape[axis] - self.side + 1
-        # The lesser of two numbers is found far faster than one is chosen by a condition.
+        # torch.minimum is far faster than torch.where.
         limits = torch.where(step.view(-1, 1, 1, 1, 1) < size, torch.iinfo(maps.dtype).max, NEVER).to(maps.dtype)
         parts = (torch.minimum(maps.narrow(axis, at, count), limit) for at, limit in enumerate(limits.unbind(0)))
         return reduce(torch.maximum, parts)
 
     def least(self, values: Tensor) -> Tensor:
-        """Return the least of values on the cells that are as high as what the item rests on, int64 of the shape of
-        ``z``.
+        """Return the least value on the highest cells under the item, on which it rests, int64 of the shape of ``z``.
 
-        A height and a value make one number, so that one maximum is of the highest, and of these the least value.
+        Each height and value are packed into one number. Its maximum belongs to the highest cells, and among these to
+        the least value.
 
         Args:
             values: int64 ``[N, W_T, D_T]``, from -1 to 2**31 - 1.
@@ -122,10 +122,10 @@ class OnFootprints(Contact):
             yield self.padded.take((place + x * self.padded.shape[1] + y).expand_as(self.z))
 
     def ends(self) -> Iterator[Tensor]:
-        """Yield as of :meth:`Contact.ends`.
+        """Yield the same as :meth:`Contact.ends`.
 
-        A surface and a place along y make one number, so that a maximum over a row of the footprint is of both. It is
-        the same for all footprints that begin at this y, whichever of their rows it is.
+        Each surface and its place along y are packed into one number, so that one maximum over a row of the footprint
+        finds both. All footprints that begin at this y share the maximum of a row.
         """
         wide, deep, _ = self.surface.shape
         places = 2 ** (deep - 1).bit_length()
@@ -134,7 +134,7 @@ class OnFootprints(Contact):
         surface, margins = self.surface.to(whole) * places, (0, self.side - 1, 0, self.side - 1)
         marked = torch.stack([surround(surface + at, margins, 2 * FAR * places) for at in (y, deep - 1 - y)])
         highest = self._highest(marked[:, None], -2, self.d)  # [2, Q, W_T + S - 1, D_T, N]
-        # How far a supporting cell goes is the excess over this; other numbers are not greater.
+        # The reach of a supporting cell is the excess over this; other cells have no excess.
         before = torch.stack(torch.broadcast_tensors(y, deep - self.d.to(whole) - y))
         none = self.supporting.to(whole) * places - 1 + before
         for x in range(self.side):
@@ -143,15 +143,15 @@ class OnFootprints(Contact):
 
 
 class LargeItems(OnFootprints):
-    """The same for large items on fine grids, where the work must not grow with the area of an item.
+    """The same for large items on fine grids: the work does not grow with the area of an item.
 
-    The cells that have the height of the supporting ones are counted in a table for each height in a tote.
+    Supporting cells are counted by a table of sums for each surface value in the totes.
     """
 
     @property
     def count(self) -> Tensor:
         levels = torch.cat([self.surface.unique(), self.surface.new_tensor([4 * FAR])])
-        # Where no cell bears weight, the height is a greater one, which no cell under the item has.
+        # Where no cell bears weight, the level is that of a greater surface, which no cell under the item has.
         level = torch.searchsorted(levels, self.supporting)
         at_once = max(1, MAX_LEVELS // (len(levels) * self.surface.shape[0] * self.surface.shape[1]))
         parts = zip(*(part.split(at_once, -1) for part in (self.surface, self.w, self.d, level)), strict=True)
@@ -161,7 +161,7 @@ class LargeItems(OnFootprints):
 
 @lru_cache(maxsize=64)
 def leaving_places(shapes: tuple[EffectorShape, ...], grid: tuple[int, int], device: torch.device) -> Tensor:
-    """Return the place cells at which the end effector leaves the tote, bool ``[B, W_T, D_T, 1]``, for each shape."""
+    """Return a mask of the place cells at which each shape leaves the tote, bool ``[B, W_T, D_T, 1]``."""
     x, y = torch.arange(grid[0], device=device)[:, None], torch.arange(grid[1], device=device)
     leaves = [
         is_outside(x - shape.ref_x, shape.width, grid[0]) | is_outside(y - shape.ref_y, shape.depth, grid[1])
@@ -171,9 +171,9 @@ def leaving_places(shapes: tuple[EffectorShape, ...], grid: tuple[int, int], dev
 
 
 def over_tote(cell: CellSpec, surface: Tensor, rim: Tensor) -> Over:
-    """Return the facts of the end effector over every place cell; each ``[T, W_T, D_T, N]``, or broadcasts to that.
+    """Return the facts of the end effector over every place cell; each broadcasts to ``[T, W_T, D_T, N]``.
 
-    ``T`` counts :attr:`~pickplace.rules.cell.CellSpec.effectors`; with limits of the robot, rotations.
+    ``T`` is the number of :attr:`~pickplace.rules.cell.CellSpec.effectors`; with limits of the robot, of rotations.
 
     Args:
         surface: int32 ``[N, W_T, D_T]``.

@@ -49,21 +49,21 @@ class Failure(IntEnum):
 
 
 class Episode(NamedTuple):
-    """What episodes may differ in beside the height of the tote, ``[N]`` each; None where all are alike.
+    """The settings in which episodes may differ besides the tote height, ``[N]`` each; None if all are alike.
 
     See :attr:`~pickplace.rules.cell.CellSpec.varies`.
     """
 
-    item_mix: Tensor | None = None  # int64: which of the item distribution's mixes of kinds
-    turns: Tensor | None = None  # int64: bit mask of the rotations that are allowed, as of an item
-    bin_items: Tensor | None = None  # int64: how many items the bin holds at most
+    item_mix: Tensor | None = None  # int64: number of the item distribution's mix of kinds
+    turns: Tensor | None = None  # int64: bit mask of the allowed rotations, as in an item
+    bin_items: Tensor | None = None  # int64: greatest number of items in the bin
     refill: Tensor | None = None  # int64: index of the rule in REFILLS
-    preview: Tensor | None = None  # int64: how many of the next items are seen
+    preview: Tensor | None = None  # int64: number of the next items that are seen
     level: Tensor | None = None  # int64: number of the curriculum's level
 
     @classmethod
     def from_observation(cls, observation: Observation) -> "Episode":
-        """Return what the entries of an observation say."""
+        """Return the settings in the entries of an observation."""
         read = {key: observation.get(key, None) for key in ("item_mix", "bin_items", "refill", "preview", "level")}
         rotations = observation.get("rotations", None)
         return cls(
@@ -72,7 +72,7 @@ class Episode(NamedTuple):
         )
 
     def rows(self, index) -> "Episode":
-        """Return those of some problems, by their numbers."""
+        """Return the settings of some problems, by their numbers."""
         return Episode(*(part if part is None else part[index] for part in self))
 
 
@@ -82,12 +82,12 @@ FULL_TASK = Episode()
 class State(NamedTuple):
     """Everything that the rules need to know of ``N`` problems."""
 
-    surface: Tensor  # int32 [N, W_T, D_T]: of what the tote holds, see `surface_from`
+    surface: Tensor  # int32 [N, W_T, D_T]: heights in the tote and bearing flags, see `surface_from`
     tote_height: Tensor  # int64 [N]: height of the episode's tote, H_T
     items: Item  # in the bin, [N, M]
-    episode: Episode = FULL_TASK  # what the running episodes may differ in
-    pile: Pile | None = None  # of the items in the tote; None: any item bears any load
-    coming: Item | None = None  # those that arrive next, in their order, [N, p]; None: none are seen
+    episode: Episode = FULL_TASK  # settings in which the running episodes may differ
+    pile: Pile | None = None  # the items in the tote; None: any item bears any load
+    coming: Item | None = None  # items that arrive next, in their order, [N, p]; None: none are seen
 
     @classmethod
     def from_observation(cls, observation: Observation) -> "State":
@@ -112,17 +112,17 @@ class State(NamedTuple):
         return (self.surface & 1).bool()
 
     def rows(self, index) -> "State":
-        """Return the state of some problems, by their numbers, which may come up more than once."""
+        """Return the state of some problems, by their numbers, which may repeat."""
         parts = self.surface[index], self.tote_height[index], self.items.rows(index), self.episode.rows(index)
         pile = None if self.pile is None else self.pile.rows(index)
         return State(*parts, pile, None if self.coming is None else self.coming.rows(index))
 
     def each_item(self) -> tuple[Tensor, Tensor, Item]:
-        """Return a problem for each item, those of a bin one after the other.
+        """Return one problem for each item; the items of a bin follow one another.
 
         Returns:
             Surface ``[N * M, W_T, D_T]``, height of the tote ``[N * M]``, item ``[N * M]``. With one item in a bin they
-            are no copies.
+            are not copies.
         """
         count = self.items.x.shape[1]
         each = self if count == 1 else self.repeat(count)
@@ -130,8 +130,8 @@ class State(NamedTuple):
 
     @property
     def capacity(self) -> Tensor | None:
-        """The greatest mass that each cell of the tote bears for each item of :meth:`each_item`, int64
-        ``[N * M, W_T, D_T]``; None: any."""
+        """The greatest mass that each cell of the tote bears, int64 ``[N * M, W_T, D_T]``, one map for each item of
+        :meth:`each_item`; None: any mass."""
         return None if self.pile is None else self.pile.capacity.repeat_interleave(self.items.x.shape[1], 0)
 
     def repeat(self, count: int) -> "State":
@@ -140,10 +140,10 @@ class State(NamedTuple):
 
 
 def surface_from(heights: Tensor, bearing: Tensor | int = 1) -> Tensor:
-    """Return twice the heights, and one more where a cell bears weight: int32 of the same shape.
+    """Return twice the heights, plus one where a cell bears weight: int32 of the same shape.
 
-    The two stay in one number, because the rules ask about them together: the cells that support an item are those
-    with the greatest possible value under it.
+    One number holds both, because the rules need them together: the cells that support an item are those with the
+    greatest possible value under it.
 
     Args:
         heights: whole numbers.

@@ -33,7 +33,7 @@ class Step(NamedTuple):
     footprint: Tensor  # int64 [N, 4]: x, y, w, d of the footprint in the tote
     item: Item  # the item that is taken, [N]
     taken: Tensor  # int64 [N]: its number in the bin
-    pile: Pile | None  # of the items in the tote, see State
+    pile: Pile | None  # the items in the tote, see State
 
 
 def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
@@ -49,7 +49,7 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     )
     taken, item, blocked = take_item(cell, items, action)
     picked, rotation, (left, front, wide, deep), (x, y, w, d) = carry(cell, item, action, blocked)
-    # Cells outside the tote do not matter: an item there fails, and of the end effector some cell is always inside.
+    # Cells outside the tote do not matter: an item there fails, and some cell of the end effector is always inside.
     contact, index = _contact(cell, surface, x, y, w, d)
     top, reach = contact.z.long() + item.h, max(ee_w, ee_d)
     covered = body_cells(cell.effectors, reach, action.device)  # [reach * reach, B]
@@ -86,11 +86,11 @@ def body_cells(shapes: tuple[EffectorShape, ...], side: int, device: torch.devic
 def put_down(cell: CellSpec, state: State, choice: Tensor) -> tuple[State, Item]:
     """Return the state after a successful choice, before other items arrive, and the item that is placed, ``[N]``.
 
-    :func:`~pickplace.rules.bin.let_in` returns the state after those have arrived that are seen.
+    :func:`~pickplace.rules.bin.let_in` then adds the items of the preview.
 
     Args:
         choice: int64 ``[N]``, ``item * num_footprints + footprint``, with the index of
-            :func:`~pickplace.rules.grasps.footprint_index`; one that some action reaches.
+            :func:`~pickplace.rules.grasps.footprint_index`; some action must reach it.
     """
     wide, deep = state.surface.shape[1:]  # an exported network serves any tote
     places = cell.parities * wide * deep
@@ -119,13 +119,13 @@ def _contact(cell: CellSpec, surface: Tensor, x: Tensor, y: Tensor, w: Tensor, d
 
 
 def _least_capacity(pile: Pile, contact: Contact, index: Tensor) -> Tensor:
-    """Return the greatest mass that items may have, int64 ``[N]``; contact and index as of :func:`_contact`."""
+    """Return the greatest mass that items may have, int64 ``[N]``; for the arguments see :func:`_contact`."""
     capacity = pile.capacity.flatten(1).t().gather(0, index)
     return torch.where(_touched(contact), capacity, NO_LIMIT).amin(0)
 
 
 def _touched(contact: Contact) -> Tensor:
-    """Return which cells items rest on, whether these bear weight or not, bool ``[S * S, N]``."""
+    """Return a mask of the cells that items rest on, whether these bear weight or not, bool ``[S * S, N]``."""
     return contact.under & (contact.surfaces >> 1 == contact.z)
 
 
@@ -133,14 +133,15 @@ def _add_item(
     cell: CellSpec, surface: Tensor, pile: Pile | None, item: Item, x: Tensor, y: Tensor, contact: Contact,
     index: Tensor, height: Tensor,
 ) -> tuple[Tensor, Pile | None]:  # fmt: skip
-    """Return totes, int32 ``[N, W_T, D_T]``, and piles with an item in them; contact and index as of :func:`_contact`.
+    """Return totes, int32 ``[N, W_T, D_T]``, and piles after an item is added.
 
     Args:
         surface: int32 ``[N, W_T, D_T]``.
-        pile: of the items in the totes.
+        pile: the items in the totes.
         item: ``[N]``.
         x, y: minimum corner of the footprint, int64 ``[N]``.
-        height: of the item, int64 ``[N]``; 0 for no item.
+        contact, index: see :func:`_contact`.
+        height: height of the item, int64 ``[N]``; 0 for no item.
     """
     grid, added = surface.shape[1:], height > 0
     inside = rectangle(grid, x, y, contact.w, contact.d) & added

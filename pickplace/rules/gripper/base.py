@@ -22,7 +22,7 @@ def reference_cell(side):
 def effector_centre(at, side):
     """Return the gripper's centre along a side, with its reference cell at ``at``; in cells, numbers or tensors.
 
-    It comes from the rectangle: on even sides the reference cell is half a cell off.
+    The centre is that of the rectangle; with an even side, the reference cell's middle is half a cell off.
     """
     return at - reference_cell(side) + side / 2
 
@@ -42,7 +42,7 @@ class Gripper(ABC):
     """A gripper: body and cup, in a rectangle of cells, and a grip rule.
 
     A grip rule of your own is a subclass with :attr:`least_cells`, and a config file: ``gripper: {_target_:
-    my_module.MyRule, size: [3, 3]}``. Where the number of the cup's cells on the item does not decide alone, override
+    my_module.MyRule, size: [3, 3]}``. If the number of the cup's cells on the item is not enough to decide, override
     :meth:`is_gripped`, too. Further fields of the dataclass are settings; they must be numbers, texts or tuples.
 
     Args:
@@ -51,13 +51,13 @@ class Gripper(ABC):
             inscribed in it touches; or a mask, ``W_E`` lists of ``D_E`` times 0 or 1, with a 1 on each edge.
         cup: the cells that grip the item: ``"rectangle"`` or ``"disc"`` of ``cup_size``, or a mask as ``body``'s. They
             must be cells of the body.
-        cup_size: ``(w, d)`` of the cup, in the middle of the body; None: ``size``. None with a mask.
+        cup_size: ``(w, d)`` of the cup, in the middle of the body; None: ``size``. It must be None with a mask.
 
     Raises:
         ValueError: naming the argument, the value received and what was expected.
     """
 
-    misfit = "the cup does not fit on this item"  # why an item is gripped nowhere
+    misfit = "the cup does not fit on this item"  # the reason if an item cannot be gripped
 
     size: tuple[int, int] = (3, 3)
     body: str | Mask = "rectangle"
@@ -90,7 +90,7 @@ class Gripper(ABC):
     @property
     @abstractmethod
     def least_cells(self) -> int:
-        """The least number of the cup's cells on an item, whatever its size, with which it may be gripped."""
+        """Lower bound of the number of the cup's cells on a gripped item, whatever the item's size."""
 
     @property
     def largest_item(self) -> tuple[int, int] | None:
@@ -98,13 +98,13 @@ class Gripper(ABC):
         return None
 
     def is_gripped(self, near_x: Tensor, near_y: Tensor, w: Tensor, d: Tensor, inset: tuple[int, int]) -> Tensor:
-        """Return whether the gripper grips the item: by default whether enough cells of the cup lie on it.
+        """Return whether the gripper grips the item: by default, if at least :attr:`least_cells` of the cup lie on it.
 
         Args:
             near_x, near_y: from the gripper's minimum corner to the item's, before turning, in cells; negative if the
                 item begins before it. They broadcast.
             w, d: sides of the item.
-            inset: cells at each edge of the item, along x and y, that a measured item may cover in part only.
+            inset: cells at each edge of the item, along x and y, that a measured item may cover only in part.
         """
         if any(inset):
             x, y = inset
@@ -112,12 +112,12 @@ class Gripper(ABC):
         return self.count_cells(self.shared_sides(near_x, near_y, w, d)) >= self.least_cells
 
     def can_grip(self, w: int, d: int, inset: tuple[int, int] = (0, 0)) -> bool:
-        """Return whether an item of ``w x d`` cells is gripped anywhere on it; ``inset`` as of :meth:`is_gripped`."""
+        """Return whether an item of ``w x d`` cells can be gripped somewhere; for ``inset`` see :meth:`is_gripped`."""
         near_x, near_y = (torch.arange(1 - side, own) for side, own in zip((w, d), self.size, strict=True))
         return bool(self.is_gripped(near_x[:, None], near_y, torch.tensor(w), torch.tensor(d), inset).any())
 
     def shared_sides(self, near_x: Tensor, near_y: Tensor, w: Tensor, d: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Return how many cells an item shares with each rectangle of the cup along x and y; negative beside it."""
+        """Return the number of cells, along x and y, that an item and each box of the cup share; negative if apart."""
 
         def shared(near: Tensor, side: Tensor, begin: int, length: int) -> Tensor:
             return (near + side).clamp_(max=begin + length) - near.clamp(min=begin)
@@ -126,13 +126,13 @@ class Gripper(ABC):
 
     @staticmethod
     def count_cells(shared: list[tuple[Tensor, Tensor]]) -> Tensor:
-        """Return how many of the cup's cells lie on an item, from :meth:`shared_sides`."""
+        """Return the number of the cup's cells that lie on an item, from :meth:`shared_sides`."""
         return reduce(torch.add, [x.clamp(min=0) * y.clamp(min=0) for x, y in shared])
 
     def offsets(self, longest: int, rotations: int) -> range:
-        """Return the offsets of an item under the gripper with which it may be gripped, along either axis, at any turn.
+        """Return the range of an item's offsets under the gripper that a grip allows, along either axis, in any turn.
 
-        An item covers lines of cells in which there are at least :attr:`least_cells` of the cup.
+        The lines of cells that a gripped item covers contain at least :attr:`least_cells` of the cup.
 
         Args:
             longest: longest side of any item.
@@ -157,12 +157,12 @@ class Gripper(ABC):
 
     @cached_property
     def body_parts(self) -> tuple[Polygon, ...]:
-        """Convex polygons that cover the body, before turning, in cells from its centre: it may turn by any angle."""
+        """Convex polygons that cover the body, before turning, in cells from its centre; for turns by any angle."""
         return parts(self.body, self.size)
 
     @property
     def cup_lines(self) -> tuple[Mask, Mask]:
-        """The cup's lines across x, and across y."""
+        """The cup's lines of cells: one for each x, and one for each y."""
         return self.cup_mask, tuple(zip(*self.cup_mask, strict=True))
 
     @cached_property

@@ -11,7 +11,7 @@ from pickplace.rules.gripper.base import Gripper
 
 @dataclass(frozen=True)
 class Contain(Gripper):
-    """Grips an item that the cup covers as a whole, whatever part of its edge is uncertain."""
+    """Grip an item that the cup covers completely, uncertain edges included."""
 
     least_cells = 1
     misfit = "the cup does not cover this item"
@@ -24,7 +24,7 @@ class Contain(Gripper):
 
     def is_gripped(self, near_x: Tensor, near_y: Tensor, w: Tensor, d: Tensor, inset: tuple[int, int]) -> Tensor:
         shared = self.shared_sides(near_x, near_y, w, d)
-        if len(shared) == 1:  # the same along each axis, which is faster
+        if len(shared) == 1:  # the same test along each axis, which is faster
             return (shared[0][0] == w) & (shared[0][1] == d)
         return self.count_cells(shared) >= w * d
 
@@ -34,17 +34,17 @@ class Contain(Gripper):
 
 @dataclass(frozen=True)
 class Overlap(Gripper):
-    """Grips an item on which a cell of the cup lies."""
+    """Grip an item on which at least one cell of the cup lies."""
 
     least_cells = 1
 
 
 @dataclass(frozen=True)
 class Seal(Gripper):
-    """Grips an item on which a share of the cup's cells lies.
+    """Grip an item on which at least a share of the cup's cells lies.
 
     Args:
-        min_seal: that share or more, above 0.
+        min_seal: the least share, above 0.
     """
 
     min_seal: float = 1.0
@@ -60,14 +60,14 @@ class Seal(Gripper):
         return next(n for n in range(1, total + 1) if n / total >= self.min_seal)
 
 
-#: Grip rules by the names that Python's short form has for them.
+#: Grip rules by their names in Python's short form.
 GRIP_RULES: dict[str, type[Gripper]] = {"contain": Contain, "overlap": Overlap, "seal": Seal}
 
 
 def changed_gripper(gripper: Gripper, pick_rule: str | None = None, **settings) -> Gripper:
     """Return a gripper with another grip rule, a key of :data:`GRIP_RULES`, or with other settings.
 
-    What is None stays as it is; a setting that the rule does not have is ignored.
+    Values that are None change nothing; a setting that the rule does not have is ignored.
     """
     rule = type(gripper) if pick_rule is None else GRIP_RULES[one_of("pick_rule", pick_rule, GRIP_RULES)]
     known = [field.name for field in fields(rule)]

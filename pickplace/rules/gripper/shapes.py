@@ -1,6 +1,6 @@
 """Shapes of the gripper: which cells of its rectangle are body, and which are cup.
 
-A mask is a tuple of columns, ``mask[x][y]``, of 0 and 1. Plain integers: no tensor is needed before masks are used.
+A mask is a tuple of columns, ``mask[x][y]``, of 0 and 1: plain integers, as no tensor is needed before masks are used.
 """
 
 import math
@@ -35,7 +35,7 @@ def is_in_disc(x: int, y: int, width: int, depth: int) -> bool:
 
 
 def read_shape(key: str, value: Any, size: tuple[int, int]) -> str | Mask:
-    """Return a shape as it was given, with a mask as tuples; ``ValueError`` if it is neither a name nor a mask."""
+    """Return a shape as given, a mask as tuples; raise ``ValueError`` if it is neither a name nor a mask."""
     if isinstance(value, str) and value in ("rectangle", "disc"):
         return value
     try:
@@ -52,7 +52,7 @@ def read_shape(key: str, value: Any, size: tuple[int, int]) -> str | Mask:
 
 
 def centred(shape: str | Mask, inner: tuple[int, int], size: tuple[int, int]) -> Mask:
-    """Return a rectangle or disc of ``inner`` cells in the middle of a mask of ``size``; a mask as it is."""
+    """Return a rectangle or disc of ``inner`` cells in the middle of a mask of ``size``; a mask unchanged."""
     if not isinstance(shape, str):
         return shape
     x0, y0 = ((outer - side) // 2 for outer, side in zip(size, inner, strict=True))
@@ -71,7 +71,7 @@ def turned(mask: Mask) -> Mask:
 
 
 def boxes(mask: Mask) -> tuple[Box, ...]:
-    """Return rectangles that do not overlap and cover the ones of a mask; a rectangle is one."""
+    """Return rectangles that do not overlap and cover the ones of a mask; one for a rectangular mask."""
     found: list[Box] = []
     open_runs: dict[tuple[int, int], int] = {}  # (y, depth) of the runs of the column before -> where they began
     for x, column in enumerate((*mask, ())):
@@ -85,15 +85,15 @@ def boxes(mask: Mask) -> tuple[Box, ...]:
 
 
 def _runs(column: Sequence[int]) -> list[tuple[int, int]]:
-    """Return where the runs of ones begin, and their lengths."""
+    """Return the start and the length of each run of ones."""
     groups = (list(group) for _, group in groupby(enumerate(column), key=lambda entry: entry[1]))
     return [(group[0][0], len(group)) for group in groups if group[0][1]]
 
 
 def parts(shape: str | Mask, size: tuple[int, int]) -> tuple[Polygon, ...]:
-    """Return convex polygons that cover a shape of ``size``, in cells from the middle of it.
+    """Return convex polygons that cover a shape of ``size``, in cells from its middle.
 
-    Those of a mask are its rectangles. Around a disc there is one polygon, which touches the same sides of ``size``.
+    A mask gives its rectangles. A disc gives one polygon around it, which touches the same sides of ``size``.
     """
     wide, deep = size
     if shape == "disc":

@@ -1,6 +1,6 @@
 """A robot that reaches an upright hollow cylinder about its base.
 
-All lengths are in sides of a cell, heights too, whatever the cell's height unit is.
+All lengths, heights included, are in sides of a cell, whatever the cell's height unit is.
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ class Annulus(Reach):
         radii: least and greatest distance of the suction face's centre from the axis.
         heights: lowest and highest suction face.
         bin: near corner of the bin's floor, ``(x, y, z)`` in the base's frame.
-        tote: the same of the tote.
+        tote: near corner of the tote's floor, in the same frame.
 
     Raises:
         ValueError: naming the argument, the value received and what was expected.
@@ -72,7 +72,7 @@ class Annulus(Reach):
         return self._range(cell, self.bin, x, y)
 
     def _range(self, cell: CellSpec, corner: tuple[float, ...], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Return lowest and highest suction face at points of a grid with that corner, int32, in height units."""
+        """Return lowest and highest suction face at points of a grid with that near corner, int32, in height units."""
         distance = torch.hypot(x + corner[0], y + corner[1])
         inside = (distance >= self.radii[0] - ROUNDING) & (distance <= self.radii[1] + ROUNDING)
         lowest, highest = whole_heights(cell, *torch.tensor(self.heights, dtype=torch.float64) - corner[2])

@@ -1,4 +1,4 @@
-"""The robot's reach, a setting of the cell, and the tables that the rules read of it."""
+"""The robot's reach, a setting of the cell, and the tables of limits that the rules read."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
@@ -12,16 +12,16 @@ from pickplace.rules.maps import FAR, NEVER
 
 #: Greatest coordinate, in sides of a cell.
 MAX_COORDINATE = 1e5
-#: By how much rounded numbers may pass a limit: three times 0.1 is not exactly 0.3 in binary fractions.
+#: Tolerance of limits for rounding errors: three times 0.1 is not exactly 0.3 in binary fractions.
 ROUNDING = 1e-6
 
 
 class Reach(ABC):
-    """The robot's reach, a setting of the cell; two of the same reach are equal."""
+    """The robot's reach, a setting of the cell; objects of the same reach are equal, except :class:`Limits`."""
 
     @abstractmethod
     def limits(self, cell: Any) -> "Limits":
-        """Return what a robot of this reach may do in a :class:`~pickplace.rules.cell.CellSpec`."""
+        """Return the limits of a robot with this reach in a :class:`~pickplace.rules.cell.CellSpec`."""
 
     def picks(self, cell: Any, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor] | None:
         """Return the range of heights of the suction face for centres of the gripper anywhere in the bin.
@@ -31,8 +31,8 @@ class Reach(ABC):
             x, y: from the bin's corner, in cells; float64 of one shape.
 
         Returns:
-            Lowest and highest, in height units, integers of that shape, an empty range where the robot cannot go;
-            None: only what lies between pick cells that are all reached is known to be reached.
+            Lowest and highest, in height units, integers of that shape; an empty range where the robot cannot go.
+            None: unknown; a centre then counts as reached if the robot reaches all pick cells around it.
         """
         return None
 
@@ -43,8 +43,8 @@ class Limits(Reach):
 
     Attributes:
         pick_ok: bool ``[P]``, whether the robot reaches each pick cell.
-        lowest_top, highest_top: int ``[R, W_T, D_T]``, the range in which the item's top, where the suction face is,
-            must be for each rotation and place cell; in height units. An empty range forbids the place cell.
+        lowest_top, highest_top: int ``[R, W_T, D_T]``, the range of the item's top, which is level with the suction
+            face, for each rotation and place cell; in height units. An empty range forbids the place cell.
         lowest_pick, highest_pick: int ``[P]``, the same range for each pick cell; None: any height.
     """
 
@@ -58,7 +58,7 @@ class Limits(Reach):
         return self
 
     def check(self, cell: Any) -> None:
-        """Refuse tables of another shape or type than the cell needs, with a ``ValueError`` that names the table."""
+        """Raise ``ValueError`` for tables of another shape or type than the cell needs, naming the table."""
         picks, places = [cell.num_picks], [cell.rotations, *cell.tote_size[:2]]
         shapes = {"pick_ok": picks, "lowest_top": places, "highest_top": places}
         if self.lowest_pick is not None or self.highest_pick is not None:
@@ -82,6 +82,6 @@ class Limits(Reach):
 
 
 def whole_heights(cell: Any, lowest: Tensor, highest: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the ranges of whole height units inside ranges in sides of a cell, int32; from 0 to beyond any height."""
+    """Return the whole height units inside ranges in sides of a cell, as ranges, int32, from 0 to above any height."""
     low, high = lowest / cell.height_unit - ROUNDING, highest / cell.height_unit + ROUNDING
     return low.clamp(0, FAR).ceil().int(), high.clamp(NEVER, FAR).floor().int()

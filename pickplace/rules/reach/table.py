@@ -1,4 +1,4 @@
-"""A robot that reaches the poses of a file, such as one that its inverse kinematics made."""
+"""A robot that reaches the poses in a file, which its inverse kinematics may have made."""
 
 import math
 from dataclasses import dataclass, field
@@ -28,9 +28,9 @@ class ReachTable(Reach):
         ValueError: for a file that cannot be used, naming the line and the value.
     """
 
-    path: str = field(compare=False)  # of a table the content counts, not its place
+    path: str = field(compare=False)  # tables with the same content are equal
     rows: tuple[tuple[str, int, int, int, float, float], ...] = field(init=False, repr=False)
-    lines: dict[tuple, int] = field(init=False, repr=False, compare=False)  # of each pose
+    lines: dict[tuple, int] = field(init=False, repr=False, compare=False)  # line number of each pose
 
     def __post_init__(self):
         path, rows = str(self.path), []

@@ -1,1 +1,1 @@
-"""Stability rules: whether what an item rests on keeps it stable, and where it may bear weight itself."""
+"""Stability rules: whether an item is stable where it rests, and where its top bears weight."""

@@ -8,7 +8,7 @@ from pickplace.rules.support.contact import Contact, Patches
 
 
 class Support(ABC):
-    """A stability rule: whether what an item rests on keeps it stable, and where the item may bear weight itself.
+    """A stability rule: whether an item is stable where it rests, and where its top bears weight.
 
     A subclass is a frozen dataclass, whose fields are the rule's settings.
     """
@@ -18,7 +18,7 @@ class Support(ABC):
         """Return whether items on the grid are stable where they come to rest, bool of the shape of ``contact.z``."""
 
     def bearing(self, contact: Contact) -> Tensor:
-        """Return which cells under an item bear weight once it lies there, bool ``[S * S, N]``; by default all of them.
+        """Return a mask of the cells on which an item at rest bears weight, bool ``[S * S, N]``; by default all.
 
         ``S`` is the side of the square of cells at each footprint's minimum corner.
         """
@@ -27,8 +27,8 @@ class Support(ABC):
     def measured(self, patches: Patches) -> Tensor:
         """Return whether an item is stable on a surface that was measured, bool of the shape of ``patches.share``.
 
-        It is asked where patches under the item support nothing. Whatever it returns, the item's centre must be inside
-        the hull of what carries it. Without a rule of its own, everything under the item must carry it.
+        It decides if some patches under the item support nothing. In addition, the item's centre must be inside the
+        hull of what carries it. By default, everything under the item must carry it.
         """
         return patches.full
 

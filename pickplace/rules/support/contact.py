@@ -1,4 +1,4 @@
-"""What supports an item where it comes to rest: on the grid, and on a surface that was measured.
+"""Contact of an item at rest with what supports it: on the grid, and on a measured surface.
 
 The *supporting cells* are the cells under the footprint that are as high as the highest of them, and bear weight.
 """
@@ -20,15 +20,15 @@ class Contact:
     """The supporting cells of many items; each quantity is computed when a rule asks for it.
 
     Args:
-        surfaces: of each cell of a square at the footprint's minimum corner, row by row, int32: one tensor
-            ``[S * S, ...]``, or one for each cell.
+        surfaces: surface of each cell of a square at the footprint's minimum corner, row by row, int32: one tensor
+            ``[S * S, ...]``, or a tensor for each cell.
         under: whether the item covers these cells, bool, broadcastable.
         z: the height on which the item rests, int32.
         w, d: the footprint's sides, broadcastable; 0 for no item.
 
     Attributes:
         supporting: the surface of a supporting cell, int32 of the shape of ``z``.
-        side: ``S``, of the square.
+        side: ``S``, side of the square.
     """
 
     def __init__(self, surfaces: Tensor, under: Tensor, z: Tensor, w: Tensor, d: Tensor):
@@ -36,7 +36,7 @@ class Contact:
         self.supporting, self.side = surface_from(z), round(len(under) ** 0.5)
 
     def cells(self) -> Iterator[Tensor]:
-        """Yield for each cell of the square, row by row, whether it is a supporting one, bool of the shape of ``z``."""
+        """Yield for each cell of the square, row by row, whether it supports the item, bool of the shape of ``z``."""
         for surface, used in zip(self.surfaces, self.under, strict=True):
             yield (surface == self.supporting) & used
 
@@ -49,9 +49,9 @@ class Contact:
         return count
 
     def ends(self) -> Iterator[Tensor]:
-        """Yield for each row of the square along y how far supporting cells go, int32 ``[2, *shape of z]``.
+        """Yield for each row of the square along y how far its supporting cells reach, int32 ``[2, *shape of z]``.
 
-        First from the footprint's near side to the last of them, then from its far side to the first; 0: there is none.
+        The last of them is counted from the footprint's near side, then the first from its far side; 0: there is none.
         """
         rows = ((self.surfaces == self.supporting) & self.under).unflatten(0, (self.side, self.side))
         step = torch.arange(self.side, dtype=torch.int32, device=rows.device)[:, None]
@@ -61,7 +61,7 @@ class Contact:
     def rows(self) -> Iterator[tuple[Tensor, Tensor]]:
         """Yield the first and the last supporting cell of each row of the square along y, int32 of the shape of ``z``.
 
-        They are counted from the square's corner. Without one, the first is at least ``side``, and the last is -1.
+        They are counted from the square's corner. In a row without any, the first is ``side``, and the last is -1.
         """
         for far, near in self.ends():
             yield torch.where(near > 0, self.d.int() - near, self.side), far - 1
@@ -106,9 +106,9 @@ class Contact:
     def _is_centre_among_corners(self, margin: float) -> Tensor:
         """Return the same as :meth:`is_centre_in_hull`, for items of any size.
 
-        Of the upper and of the lower half circle, the directions are found up to which the arcs of corners reach
-        without a gap. The corner that is furthest in a direction is the next one along x, the further the direction is
-        turned; so each corner is looked at once, those with the smallest x first, as if seen in a mirror.
+        In the upper and in the lower half circle, find the direction up to which the arcs of corners reach without a
+        gap. As a direction turns, the corners that are furthest in it follow one another along x. So each corner is
+        visited once, by increasing x, with the table's x mirrored.
         """
         begins, ends = hull_arcs(self.side, margin, self.supporting.device)
         w, d = (size.clamp(1, self.side).int() for size in (self.w, self.d))
@@ -118,7 +118,7 @@ class Contact:
         for x, after in enumerate(chain(self.ends(), [none])):
             furthest = torch.maximum(before, after)  # of the corners on the edge between this row and the one before
             start = (w - 2 * x + 2 * self.side - 1) * columns + self.side + 1 - d
-            # Without a corner the first entry of the table, of an empty arc.
+            # Without a corner: the first entry of the table, an empty arc.
             entry = torch.minimum(torch.add(start, furthest, alpha=2), furthest * len(begins)).flatten()
             begin, end = (table.index_select(0, entry).view_as(covered) for table in (begins, ends))
             joins = begin.sub_(covered).bitwise_right_shift_(31)  # all bits, if the arc begins in what is covered
@@ -128,9 +128,9 @@ class Contact:
     def is_centre_in_hull_of_middles(self) -> Tensor:
         """Return whether the item's centre lies in the hull of the middles of the supporting cells, or on its edge.
 
-        It does if some line between two of these middles passes the centre on its far side along y, and some on its
-        near side. Such a line goes from one at ``(-a, b)`` to one at ``(a', b')``, as seen from the centre, and passes
-        at a height of the sign of ``b / a + b' / a'``: so the steepest on each side decide, and no pairs are compared.
+        It does if one line between two of these middles passes the centre on its far side along y, and one on its near
+        side. A line from ``(-a, b)`` to ``(a', b')``, relative to the centre, passes on the side given by the sign of
+        ``b / a + b' / a'``. So only the steepest slopes on each side count, and no pairs are compared.
         """
         exact = exact_dtype(self.side)
         w, d = self.w.short(), self.d.short()
@@ -145,10 +145,10 @@ class Contact:
         return (left + right >= 0).all(0)
 
     def is_centre_on_near_edge(self) -> Tensor:
-        """Return whether no supporting cell's middle has less y than the item's centre, and they are not all on a line.
+        """Return whether no supporting cell's middle has less y than the item's centre, and not all are on a line.
 
-        Only for a centre in the hull of the middles or on its edge: a line then passes through it, so that all middles
-        lie in the same direction from there, or the opposite one.
+        Valid only for a centre in the hull of the middles or on its edge. If all middles are on a line, it passes
+        through the centre, so that they lie in one direction from there, or in the opposite one.
         """
         exact = exact_dtype(self.side)
         w, d, nan = self.w.short(), self.d.short(), torch.nan
@@ -164,11 +164,11 @@ class Contact:
         return ~before & (least < most)
 
     def in_hull(self) -> Tensor:
-        """Return which cells under the items lie inside the hull of the supporting cells, bool ``[S * S, N]``.
+        """Return a mask of the cells under the items inside the hull of the supporting cells, bool ``[S * S, N]``.
 
-        Only for one footprint of each problem, with ``surfaces`` in one tensor. The hull is followed from one edge
-        between rows to the next, along the far side and the near one: from the last corner of the hull it goes to the
-        corner ahead that is furthest out, as seen from there. Only quotients of whole numbers are compared.
+        Valid only for one footprint of each problem, with ``surfaces`` in one tensor. The hull is followed on its far
+        and its near side, from one edge between rows to the next. After each corner comes the corner ahead with the
+        steepest slope outwards. Only quotients of whole numbers are compared.
         """
         side, exact = self.side, exact_dtype(self.side)
         step = torch.arange(side + 1, dtype=exact, device=self.z.device).view(-1, 1, 1)
@@ -186,32 +186,32 @@ class Contact:
             hull.append(corner + slope * (x - at))
             turns = slopes[0] == slope
             at, corner = torch.where(turns, x, at), torch.where(turns, ends[x], corner)
-        # Where the hull passes an edge between its corners, the fraction is a multiple of one over their distance.
+        # Between corners, the hull passes an edge at a multiple of 1 / (their distance), so this is a safe tolerance.
         held = torch.stack(hull) + 0.5 / side
         return (bounds <= torch.minimum(held[:-1], held[1:]).view(side, 2, 1, -1)).all(1).flatten(0, 1)
 
 
 class Patches:
-    """The patches of a measured surface that are wholly under an item, for each place of it.
+    """The patches of a measured surface that are wholly under an item, for each place of the item.
 
-    The item may be set down off its place by an error, in any direction. A patch counts only if it is under the item
-    all the same; the surface stays where it is, and the item's centre moves.
+    The item may be set down with an error in any direction. A patch counts only if it is under the item despite the
+    error. The surface does not move with the error; the item's centre does.
 
     Args:
-        supports: whether they carry the item, bool ``[W, D, patches]``; the patches are those of a rectangle of
+        supports: whether the patches carry the item, bool ``[W, D, patches]``; they are those of a rectangle of
             ``[X, Y]``, row by row.
         along: how far a patch reaches from the item's centre in each direction, float64 ``[directions, patches]``.
         cells: cell of the footprint in which each patch lies, row by row, int64 ``[patches]``.
         per_cell: number of patches along a side of a cell.
-        slack: by which a direction between two others may differ, in patches.
-        touched: number of patches that the item covers, in part too.
+        slack: greatest error of ``along`` for a direction between two of these, in patches.
+        touched: area of the item, in patches.
         error: greatest distance of the item from its place, in patches.
-        uncovered: share of each row and of each line of patches that an error to either side leaves uncovered, float64
+        uncovered: share of each row and of each line of patches that an error to either side uncovers, float64
             ``[2, X]`` and ``[2, Y]``.
-        quartered: whether each quarter of the item has a whole patch in it, whatever the error.
+        quartered: whether each quarter of the item contains a whole patch, whatever the error.
     """
 
-    #: Least distance of an item's centre from the hull's edge, in patches: as far as a patch may be covered in part.
+    #: Least distance of an item's centre from the hull's edge, in patches, as a patch may be covered only in part.
     MARGIN = 1.5
 
     def __init__(
@@ -242,10 +242,10 @@ class Patches:
 
     @property
     def full(self) -> Tensor:
-        """Whether all of the item is carried, bool ``[W, D]``, and it stays up whatever the error.
+        """Whether the whole item is carried and stays up whatever the error, bool ``[W, D]``.
 
-        Something then carries each quarter of the item, though a patch may be covered in part. (With one value a cell
-        only cells that are level bear weight.)
+        Each quarter of the item must then be carried, as a patch may be covered only in part. (With one patch a cell,
+        only level cells bear weight.)
         """
         stays = self.is_centre_in_hull() if self.per_cell == 1 else self.quartered
         return self.supports.all(-1) & stays
@@ -268,11 +268,11 @@ class Patches:
         return self._inside[margin]
 
     def in_hull(self) -> Tensor:
-        """Return which patches press inside the hull of what carries the item, bool ``[patches]``; of one place.
+        """Return a mask of the patches inside the hull of what carries the item, bool ``[patches]``; of one place.
 
-        With an error, the item may not reach a patch at its edge. Where it does, it reaches all patches of the same row
-        that are further inside, and those of the next rows on that side perhaps not. So a patch at the edge counts if
-        it carries, or lies between two of its row that do.
+        With an error, the item may not reach a patch at its edge. If it does, it reaches all patches of the same row
+        that are further inside, but perhaps not those of the next rows on that side. So a patch at the edge counts if
+        it carries the item, or lies between two patches of its row that do.
         """
         (rows, lines), flags = self.always, self.supports[0, 0]
         supports, along = self.robust

@@ -1,16 +1,16 @@
 """Hulls of supporting cells: tables that tell whether they contain an item's centre.
 
-An item tilts unless the vertical line through its centre passes the hull of what supports it. That is asked of every
-footprint, and the hull is not computed for it: the centre is inside by a margin if in every direction some corner of a
-supporting cell lies beyond the margin. Two tables answer it exactly.
+An item tilts unless the vertical line through its centre passes the hull of what supports it. This is tested for every
+footprint, without computing the hull: the centre is inside by a margin if in every direction some corner of a
+supporting cell lies beyond the margin. Two kinds of tables give the exact answer.
 
-For short items, *patterns*: the hull of cells has edges in few directions, so a supporting cell reaches beyond the
-centre along some of their normals, which is a pattern of bits. The item is stable if the patterns of its supporting
-cells cover all of them. That is as fast as counting for items of up to 3 cells.
+For short items, *patterns*: the edges of the hull have only a few possible normals. A cell's pattern has a bit for each
+normal along which the cell reaches beyond the centre. The item is stable if the patterns of its supporting cells
+together have all bits. That is as fast as counting for items of up to 3 cells.
 
-For longer ones, *arcs*: a corner lies beyond the margin in an open arc of directions, and the item is stable if the
-arcs of the outermost corners cover the circle. There are two such corners where the hull passes an edge between rows of
-cells, so the work grows with the length of a footprint, and the table with its square.
+For longer items, *arcs*: a corner lies beyond the margin in an open arc of directions. The item is stable if the arcs
+of the outermost corners cover the circle. The hull has two such corners on each edge between rows of cells, so the work
+grows with the length of a footprint, and the table with its square.
 """
 
 from functools import lru_cache
@@ -19,14 +19,14 @@ from math import gcd, pi
 import torch
 from torch import Tensor
 
-PATTERN_SIDE = 5  # longest side of items that are looked up in patterns: their 48 normals are bits of one number
+PATTERN_SIDE = 5  # longest side of items with patterns: their 48 normals are bits of one number
 WORDS = {8: torch.uint8, 16: torch.int16, 32: torch.int32, 64: torch.int64}
-COVERED = 2**30  # rank of a direction behind the half circle
-TIE = 1e-12  # radians; directions that differ by less are the same, as 1e-15 is lost in computing them
+COVERED = 2**30  # rank of a direction beyond the half circle
+TIE = 1e-12  # radians; directions that differ by less are equal, as rounding errors are about 1e-15
 
 
 def exact_dtype(side: int) -> torch.dtype:
-    """Return a type in which quotients of whole numbers up to a side are equal only if they are."""
+    """Return a dtype in which quotients of whole numbers up to ``side`` compare equal only if they are equal."""
     return torch.float32 if side <= 64 else torch.float64
 
 
@@ -57,7 +57,7 @@ def hull_patterns(side: int, margin: float, device: torch.device) -> tuple[Tenso
     furthest = (normals[:, :, None, None, None] * ends).amax(2)  # [normals, axis, cell, size]
     along = furthest[:, 0, :, None, :, None] + furthest[:, 1, None, :, None, :]  # [normals, x, y, w, d]
     beyond = along > 2 * margin * normals.double().norm(dim=1).view(-1, 1, 1, 1, 1)
-    # No edge has the direction from one cell to another that is not in the footprint.
+    # An edge joins two cells of the footprint, so normals of longer edges do not occur.
     x, y = normals.abs()[:, :, None, None].unbind(1)
     fits = ((y < size[:, None]) & (x < size)) | (x + y == 1)
     flags = torch.tensor([1 << bit for bit in range(len(normals))])
@@ -69,21 +69,21 @@ def hull_patterns(side: int, margin: float, device: torch.device) -> tuple[Tenso
 
 @lru_cache(maxsize=16)
 def hull_arcs(side: int, margin: float, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return in which directions of a half circle a corner of a cell lies beyond a margin from the item's centre.
+    """Return the arc of directions, in a half circle, in which each corner of a cell lies beyond a margin.
 
-    The corner ``(x, y)`` lies there, in half cells from the centre; ``x`` is from ``1 - 2 * side`` to ``side``, and
-    ``y`` from ``-side`` to ``side``. A direction is an angle from 0, along x, to 180 degrees, where those between point
-    to greater y. Directions are compared by their ranks, so that equal ones are equal.
+    A corner is at ``(x, y)``, in half cells from the item's centre; ``x`` is from ``1 - 2 * side`` to ``side``, and
+    ``y`` from ``-side`` to ``side``. A direction is an angle from 0, along x, to 180 degrees; angles between point to
+    greater y. Directions are compared by their ranks, so that equal directions compare equal.
 
     Args:
         side: longest side of a footprint, in cells.
-        margin: distance that must be exceeded, in cells.
+        margin: distance from the centre that a corner must exceed, in cells.
         device: place of the table.
 
     Returns:
-        the rank at which each corner's arc begins and that at which it ends, int32 ``[3 * side * (2 * side + 2)]``, by
-        x, then y. An arc without its ends. It begins at 0 if it contains the angle 0, and ends at :data:`COVERED` if it
-        contains 180 degrees; where it is empty it begins behind that. So do those of the first y, which is no corner.
+        the ranks at which each corner's arc begins and ends, int32 ``[3 * side * (2 * side + 2)]`` each, by x, then y.
+        The arc is open. It begins at 0 if it contains the angle 0, and ends at :data:`COVERED` if it contains 180
+        degrees. An empty arc begins beyond that, and so does the first y, which is no corner.
     """
     x = torch.arange(1 - 2 * side, side + 1, dtype=torch.float64)[:, None]
     y = torch.arange(-side - 1, side + 1, dtype=torch.float64)

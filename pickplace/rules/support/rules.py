@@ -54,7 +54,7 @@ class Full(Share):
 
 @dataclass(frozen=True)
 class HalfOrHull(MoreThanHalf):
-    """As :class:`MoreThanHalf`, or the centre is in the hull of the middles of the supporting cells, or on its edge.
+    """More than half is supported, or the centre is in the hull of the middles of the supporting cells or on its edge.
 
     A measured surface has no cells; there the share decides alone.
     """
@@ -81,7 +81,7 @@ class Corners(Share):
 class Cdrl(Share):
     """More than half of the footprint and its four corners are supported, or over 85% and three, or over 95%.
 
-    As in the code of Zhao et al., 2021, "Online 3D Bin Packing with Constrained Deep Reinforcement Learning", which
+    From the code of Zhao et al., 2021, "Online 3D Bin Packing with Constrained Deep Reinforcement Learning", which
     differs from their text. With over 95% three corners must be equally high, and no lower than the fourth. On a
     measured surface over 95% are needed.
     """
@@ -90,7 +90,7 @@ class Cdrl(Share):
 
     def stable(self, contact: Contact) -> Tensor:
         corners, share = contact.corners, contact.share
-        # Of up to 40 cells some corner is supported if over 95% are, so that the highest corners are supported ones.
+        # If over 95% of up to 40 cells are supported, so is some corner: the highest corners are supported ones.
         level = corners if contact.side <= 6 else contact.level_corners
         found = super().stable(contact) & (level >= 3)
         return found | ((corners >= 4) & (share > 0.5)) | ((corners >= 3) & (share > 0.85))
@@ -98,9 +98,9 @@ class Cdrl(Share):
 
 @dataclass(frozen=True)
 class Gopt(MoreThanHalf):
-    """As :class:`HalfOrHull`, but an item needs two supporting cells, and its centre may not be on the edge of least y.
+    """:class:`HalfOrHull`, but the hull needs two supporting cells, and the centre may not be on its edge of least y.
 
-    As in the code of GOPT (Xiong et al., 2024). A centre on that edge counts where the middles are all on a line. A
+    From the code of GOPT (Xiong et al., 2024). A centre on that edge counts if the middles are all on a line. A
     measured surface has no cells; there the share decides alone.
     """
 
@@ -131,9 +131,9 @@ class Hull(Support):
 
 @dataclass(frozen=True)
 class Bearing(Hull):
-    """As :class:`Hull`; and the top of an item bears weight only above the hull of its own supporting cells.
+    """The rule :class:`Hull`; the top of an item bears weight only above the hull of its supporting cells.
 
-    Whatever is put on it then presses inside that hull, down to the floor, and no item tips the pile below it.
+    Whatever is put on it then presses inside that hull, down to the floor. So no item tips the pile below it.
     """
 
     def bearing(self, contact: Contact) -> Tensor:
@@ -142,11 +142,11 @@ class Bearing(Hull):
 
 @dataclass(frozen=True)
 class RoundedUp(Bearing):
-    """As :class:`Bearing`, for items that may be up to a cell smaller than the cells that they take, at the far ends.
+    """The rule :class:`Bearing` for items that may be up to a cell smaller than the cells that they take.
 
-    The cells at these ends must bear nothing if the item does not fill them. An item whose four corners are supported
-    cannot tip then. Any other needs the margin: its centre is up to half a cell, along each axis, off the middle of its
-    cells.
+    The difference is at the far ends. Cells there must bear nothing if the item does not fill them. Then an item whose
+    four corners are supported cannot tip. Any other item needs the margin: along each axis, its centre is up to half a
+    cell off the middle of its cells.
     """
 
     def stable(self, contact: Contact) -> Tensor:
@@ -168,7 +168,7 @@ RULES: dict[str, type[Support]] = {
 
 
 def read_support(value: Any) -> Support:
-    """Return a stability rule as it is, or the one of a short form: of a name or, for :class:`Share`, a number.
+    """Return a stability rule unchanged, or the rule of a short form: a name, or the least share of :class:`Share`.
 
     Raises:
         ValueError: for anything else.
