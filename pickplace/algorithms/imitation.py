@@ -120,7 +120,7 @@ class Imitation(Algorithm):
         return self.inner.descend(data, at, self.objective)
 
     def objective(self, data: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
-        """Return the critic's loss, plus that of imitating ``data["taught"]`` if there is such an entry."""
+        """Return the critic's loss, plus the imitation loss if there is an entry ``data["taught"]``."""
         _, losses = self.inner.objective(data)
         total = losses["loss_critic"]
         if "taught" in data:

@@ -1,8 +1,8 @@
 """The softmax over a few sampled choices, for a loss whose policy has many choices.
 
 A gradient step through the softmax over all ``N_a`` flat actions computes every logit forward and backward. Here the
-loss computes only those of the *candidates*. The first one is a draw from the policy that collected, ``pi``, and is
-taken; the loss learns from it alone (``algo.advantages=gae``), or from all (``vine``). The others are drawn without
+loss computes only the logits of the *candidates*. The first one is a draw from ``pi``, the policy that collected, and
+is taken. The loss learns from it alone (``algo.advantages=gae``), or from all (``vine``). The others are drawn without
 replacement from ``q``, which is ``pi`` at a higher temperature, so that rare choices are tried more often. They are the
 choices with the greatest log-probability plus Gumbel noise (Kool, van Hoof and Welling, Stochastic Beams and Where to
 Find Them, 2019).

@@ -313,7 +313,7 @@ def apply_overrides(saved: DictConfig, overrides: list[str], groups: Any = None,
         saved: the config of a checkpoint.
         overrides: as on Hydra's command line, ``key=value``; a leading ``+`` changes nothing.
         groups: composed nodes of the config groups that may be exchanged as a whole.
-        instead: what a message suggests in place of exchanging another group.
+        instead: what a message suggests instead of exchanging another group.
 
     Raises:
         ValueError: for a group that cannot be exchanged, a key that the config does not have, or a bad value.

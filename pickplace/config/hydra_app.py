@@ -213,16 +213,16 @@ def sweep_words(merged: DictConfig, words: list[str]) -> list[str]:
 
 
 def constant_keys(words: list[str]) -> list[str]:
-    """Return the keys that have the same value in all runs of a sweep's command line, but for the seed."""
+    """Return the keys that have the same value in all runs of a sweep's command line, except the seed."""
     constant = [each for each in composition.parse(words) if not (each.is_hydra_override() or each.is_sweep_override())]
     return [key for each in constant if (key := each.get_key_element().lstrip("+~")) != "seed"]
 
 
 def folder_name(overrides: list[str], constant: list[str]) -> str:
-    """Return the name of the folder of a sweep's run: its overrides but for ``constant`` keys, the seed last.
+    """Return the folder name of a run in a sweep: its overrides except those of ``constant`` keys, the seed last.
 
-    The name needs no quotes in an override, which takes ``+`` and ``-``, but neither ``=`` nor ``,``. One that leaves
-    out letters, or would be too long, ends in a hash of the overrides.
+    An override takes the name without quotes: it may have ``+`` and ``-``, but neither ``=`` nor ``,``. A name that
+    leaves out characters, or would be too long, ends in a hash of the overrides.
     """
     pairs = sorted((word.lstrip("+~").partition("=")[::2] for word in overrides), key=lambda pair: pair[0] == "seed")
     pairs = [pair for pair in pairs if pair[0] not in constant] or pairs

@@ -184,7 +184,7 @@ def play(
         batch_size: episodes played side by side. It changes no result, except with a planner that draws random
             numbers: it has one generator for all episodes of a batch.
         record: numbers of the episodes to record move by move.
-        heat_maps: those of them to record with the planner's heat maps, which take time; None: all.
+        heat_maps: numbers of recorded episodes that get the planner's heat maps, which take time; None: all.
     """
     heat_maps = record if heat_maps is None else heat_maps
     feasible, decisions = 0.0, 0

@@ -23,7 +23,7 @@ def decide(
     """Return a planner's flat actions, int64 ``[N]``.
 
     Args:
-        choose: a function of the observation to call in place of the planner's ``decide``.
+        choose: a function of the observation to call instead of the planner's ``decide``.
 
     Raises:
         ValueError: for any other result or error, naming the planner's class and what ``decide`` returned or raised.

@@ -27,7 +27,7 @@ class Callback:
         """Called when the curriculum has moved from one level to another, with their numbers."""
 
     def state_dict(self) -> dict:
-        """Return what a checkpoint stores for a resume, as JSON: numbers, texts, lists and dicts."""
+        """Return the state that a checkpoint stores for a resume, as JSON: numbers, texts, lists and dicts."""
         return {}
 
     def load_state_dict(self, state: dict) -> None:

@@ -16,7 +16,7 @@ class Tally:
     """Input of an advance rule: the level, and counts since it began.
 
     Attributes:
-        level: number of the level trained at now.
+        level: number of the current level.
         window: final occupancies of the latest episodes that were played at the level.
         frames: frames of the whole run.
         level_start: the run's frames when the level began.
