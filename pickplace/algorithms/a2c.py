@@ -8,7 +8,7 @@ from pickplace.policies.base import as_actor
 
 
 class A2C(ActorCritic):
-    """A2C (config ``algo=a2c``); its loss does not normalise advantages, so that GAE does, in each batch."""
+    """A2C (config ``algo=a2c``). GAE normalises the advantages in each batch, because the loss does not."""
 
     averages = True
 

@@ -1,4 +1,4 @@
-"""The common part of PPO and A2C: advantages by GAE, and a loss of TorchRL's."""
+"""The common part of PPO and A2C: advantages by GAE, and a loss of TorchRL."""
 
 from abc import abstractmethod
 
@@ -19,7 +19,7 @@ class ActorCritic(MinibatchDescent):
     """Base class of algorithms that learn a policy from advantages over a critic's values.
 
     Args:
-        policy, task: as of :class:`~pickplace.algorithms.descent.MinibatchDescent`.
+        policy, task: as in :class:`~pickplace.algorithms.descent.MinibatchDescent`.
         critic: the value network.
         gamma: discount per step.
         lmbda: GAE's lambda.
@@ -30,7 +30,7 @@ class ActorCritic(MinibatchDescent):
     """
 
     drawn_keys: tuple[str, ...] = ("log_prob",)  # entries that the acting policy writes and the loss reads
-    log_prob_key = "log_prob"  # the one with the log-probabilities under the policy that collected
+    log_prob_key = "log_prob"  # the entry with the log-probabilities under the policy that collected
     averages = False  # whether GAE normalises advantages in each batch
 
     def __init__(
@@ -56,7 +56,7 @@ class ActorCritic(MinibatchDescent):
             "entropy_coeff": number("algo.entropy_coeff", entropy_coeff, most=MAX_WEIGHT),
             "critic_coeff": number("algo.critic_coeff", critic_coeff, most=MAX_WEIGHT),
         }
-        # TorchRL leaves out a part whose coefficient is 0 at first; with 1 it is computed, so that it can be logged.
+        # TorchRL leaves out a part whose initial coefficient is 0. With 1 it is computed, so that it can be logged.
         self.loss = self.make_loss(**dict.fromkeys(coefficients, 1.0), loss_critic_type="l2")
         for key, value in coefficients.items():
             getattr(self.loss, key).fill_(float(value))

@@ -40,7 +40,7 @@ class Task:
     Attributes:
         terms: of the observation, by key.
         observation: an observation of zeros, ``[1]``, with the masks of the policy.
-        reward_scale: rewards are to be multiplied by this.
+        reward_scale: factor by which rewards are to be multiplied.
         num_envs: ``N``, environment slots.
         rollout_length: ``T``, steps of each slot in a batch.
     """
@@ -71,9 +71,10 @@ class Algorithm(ABC):
 
     @abstractmethod
     def acting_policy(self) -> TensorDictModuleBase:
-        """Return the module that collects: an observation ``[N]`` in, ``action`` out, and what :meth:`learn` reads.
+        """Return the module that collects: it reads an observation ``[N]`` and writes ``action``, and what else
+        :meth:`learn` reads.
 
-        It is asked once; its parameters and buffers are sent to the collector before each batch.
+        Called once; the module's parameters and buffers are sent to the collector before each batch.
         """
 
     @abstractmethod
@@ -81,7 +82,7 @@ class Algorithm(ABC):
         """Learn from a batch ``[N, T]``; return metrics, named ``train/...``."""
 
     def state_dict(self) -> dict:
-        """Return what a checkpoint stores for a resume: nested dicts of tensors, numbers and texts."""
+        """Return the state that a checkpoint stores for a resume: nested dicts of tensors, numbers and texts."""
         return {}
 
     def load_state_dict(self, state: Any) -> None:
@@ -93,7 +94,7 @@ class Algorithm(ABC):
         matching_state(state, self.state_dict(), "algorithm")
 
     def memory(self, frame: int) -> dict[str, int]:
-        """Return bytes that learning takes at once, by the key and the value that cause them.
+        """Return the bytes that learning takes at once, by the setting, ``key=value``, that causes them.
 
         Args:
             frame: bytes of one collected frame.
@@ -101,7 +102,7 @@ class Algorithm(ABC):
         return {}
 
 
-#: Computes the loss of a minibatch ``[B]``: what is minimised, and its parts and diagnostics by name.
+#: Computes the loss of a minibatch ``[B]``, and its parts and diagnostics by name.
 Objective = Callable[[TensorDictBase], tuple[Tensor, Mapping[str, Tensor]]]
 
 
@@ -110,8 +111,8 @@ class Imitable(Protocol):
     """An algorithm whose policy can imitate a teacher before it learns from reward."""
 
     def prepare(self, batch: TensorDictBase, at: At) -> TensorDictBase:
-        """Return the frames ``[B]`` of a batch ``[N, T]`` with all that the loss reads; draws everything that is drawn
-        for it."""
+        """Return the frames ``[B]`` of a batch ``[N, T]`` with all that the loss reads. All random draws
+        for the loss are made here."""
 
     def objective(self, data: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
         """Return the loss of a minibatch, and its parts; ``loss_critic`` is the critic's."""
@@ -120,7 +121,7 @@ class Imitable(Protocol):
         """Minimise an objective on frames ``[B]``; return metrics."""
 
     def learning_memory(self, frame: int) -> dict[str, int]:
-        """Return bytes of a gradient step, by its key, if each frame takes ``frame`` bytes."""
+        """Return the bytes of a gradient step, by its setting, if each frame takes ``frame`` bytes."""
 
 
 #: Entries of an optimizer's state that count or sum squares.
@@ -133,7 +134,7 @@ def load_optimizer(optimizer: torch.optim.Optimizer, state: Any) -> None:
     Parameters that had no gradient so far have no state.
 
     Raises:
-        CheckpointError: if it does not fit the parameters, or has values that cannot be.
+        CheckpointError: if it does not fit the parameters, or has impossible values.
     """
     refuse_if(
         not isinstance(state, dict),

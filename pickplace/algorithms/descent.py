@@ -63,7 +63,7 @@ class MinibatchDescent(Algorithm):
         self.lr = number("algo.lr", lr, most=MAX_RATE)
         self.lr_decay_start = or_null(number, "algo.lr_decay_start", lr_decay_start, 0, 1)
         self.max_grad_norm = number("algo.max_grad_norm", max_grad_norm, 1e-9, MAX_WEIGHT)
-        self.schedule: dict = {"settings": "", "since": 0}  # of the learning rate, and its first frame
+        self.schedule: dict = {"settings": "", "since": 0}  # settings of the learning rate, and their first frame
 
     def acting_policy(self) -> TensorDictModuleBase:
         return as_collection_policy(self.policy)
@@ -123,7 +123,7 @@ class MinibatchDescent(Algorithm):
         if self.lr_decay_start is None:
             return self.lr
         since = self.schedule["since"]
-        frames = at.before if since else at.frames  # a run that was resumed so learns from its last batch, too
+        frames = at.before if since else at.frames  # a run resumed with a new schedule learns in its last batch, too
         left = (1 - (frames - since) / max(at.total - since, 1)) / max(1 - self.lr_decay_start, 1e-9)
         return self.lr * min(max(left, 0.0), 1.0)
 

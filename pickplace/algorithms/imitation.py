@@ -21,7 +21,7 @@ from pickplace.rules.step import apply
 from pickplace.runs import checkpoint
 from pickplace.runs.locate import locate
 
-#: Names the settings of a teacher in the errors of planners, which call them ``planner`` and ``checkpoint``.
+#: Puts the keys of ``warm_start`` into errors of planners, which begin with ``planner`` or ``checkpoint``.
 _named_keys = reworded(
     ValueError,
     lambda error: ValueError(
@@ -93,11 +93,11 @@ class WarmStart:
 
 
 class Imitation(Algorithm):
-    """An algorithm whose policy imitates a teacher first; then the critic learns alone; then it goes on as usual.
+    """An algorithm whose policy imitates a teacher first. Then the critic learns alone. Then both learn as usual.
 
     The policy itself acts from the first frame on, and the teacher is asked in the states that it reaches (DAgger, Ross
-    et al. 2011). So the policy learns how to continue after its own mistakes, and the critic learns the values of the
-    policy that it will serve. Optimizer, minibatches and the critic's loss are those of the inner algorithm.
+    et al. 2011). So the policy learns how to continue after its own mistakes, and the critic learns the values of this
+    policy. Optimizer, minibatches and the critic's loss are those of the inner algorithm.
 
     Args:
         inner: the algorithm, an :class:`~pickplace.algorithms.base.Imitable`.
@@ -120,7 +120,7 @@ class Imitation(Algorithm):
         return self.inner.descend(data, at, self.objective)
 
     def objective(self, data: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
-        """Return the critic's loss, plus that of imitating ``data["taught"]`` if there is such an entry."""
+        """Return the critic's loss, plus the imitation loss if there is an entry ``data["taught"]``."""
         _, losses = self.inner.objective(data)
         total = losses["loss_critic"]
         if "taught" in data:
@@ -141,7 +141,7 @@ class Imitation(Algorithm):
 
 
 def with_warm_start(algorithm: Algorithm, warm_start: WarmStart) -> Algorithm:
-    """Return an algorithm with a warm start, or itself if the phases of that have no frames.
+    """Return an algorithm with a warm start, or the algorithm itself if the phases of the warm start have no frames.
 
     Raises:
         ValueError: for an algorithm whose policy cannot imitate.
@@ -155,10 +155,10 @@ def with_warm_start(algorithm: Algorithm, warm_start: WarmStart) -> Algorithm:
 
 
 def imitation_loss(policy: Policy, data: TensorDictBase) -> tuple[Tensor, Tensor]:
-    """Return the mean cross-entropy against the teacher's choices ``taught``, and the share of these that the policy
-    finds most probable."""
+    """Return the mean cross-entropy against the teacher's choices ``taught``, and the share of these that are the
+    policy's most probable choices."""
     taught, logits = data["taught"], policy.logits(data)
-    # A policy that leaves out some of what is feasible cannot learn to choose that.
+    # A policy that leaves out some feasible choices cannot learn them.
     reached = logits.gather(1, taught.clamp(min=0)[:, None])[:, 0] > MASKED / 2
     taught = torch.where(reached, taught, -1)
     known = (taught >= 0).sum().clamp(min=1)

@@ -28,7 +28,7 @@ class SampledPPO(PPO):
     Args:
         samples: choices drawn in each frame beside the one that is taken.
         temperature: divides the logits from which these are drawn.
-        advantages: ``"vine"``: of each choice, by one step in the simulator; ``"gae"``: of the one that is taken.
+        advantages: ``"vine"``: of all drawn choices, by one step in the simulator; ``"gae"``: of the taken choice only.
         **settings: of :class:`~pickplace.algorithms.ppo.PPO`; normalised advantages of a vine have a unit mean square.
     """
 
@@ -64,7 +64,7 @@ class SampledPPO(PPO):
 
     def objective(self, data: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
         total, losses = super().objective(data)
-        # TorchRL's means over candidates have no weights, and say nothing about the policy.
+        # TorchRL's unweighted means over candidates say nothing about the policy.
         return total, losses.exclude("kl_approx", "clip_fraction")
 
     def memory(self, frame: int) -> dict[str, int]:
@@ -99,8 +99,8 @@ class SampledPPO(PPO):
     def _values(self, frames: TensorDictBase, items: Item) -> Tensor:
         """Return the reward of each candidate and the critic's value of what follows, ``[B, 1 + samples]``.
 
-        ``items`` has the item that arrives next, the same for all candidates of a state. A failure is worth nothing,
-        and so is what follows if that item has no feasible action.
+        ``items`` has the item that arrives next, the same for all candidates of a state. A failure has the value 0.
+        What follows has the value 0 if that item has no feasible action.
         """
         cell, candidates = self.policy.cell, frames[CANDIDATE_KEYS[0]]
         row = torch.arange(len(frames), device=candidates.device).repeat_interleave(candidates.shape[1])
@@ -134,9 +134,9 @@ def of_taken_choice(advantage: Tensor, candidates: int, normalize: bool) -> Tens
 
 
 def _arrivals(frames: TensorDictBase) -> Item:
-    """Return an item for each frame, ``[B, 1]``: one that arrived after some success of its kind of episode.
+    """Return an item for each frame, ``[B, 1]``: one that arrived after a random success in the batch.
 
-    Without any, and where the drawn one came in an episode with other items or rotations, it is the frame's own.
+    It is the frame's own item without any success, or if the drawn item is of an episode with other items or rotations.
     """
     after = frames["next"]
     placed = (after["failure"] == Failure.NONE) | (after["failure"] == Failure.STUCK)

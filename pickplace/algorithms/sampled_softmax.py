@@ -1,14 +1,14 @@
 """The softmax over a few sampled choices, for a loss whose policy has many choices.
 
 A gradient step through the softmax over all ``N_a`` flat actions computes every logit forward and backward. Here the
-loss computes only those of the *candidates*. The first one is a draw from the policy that collected, ``pi``, and is
-taken; the loss learns from it alone (``algo.advantages=gae``), or from all (``vine``). The others are drawn without
-replacement from ``q``, which is ``pi`` at a higher temperature, so that rare choices are tried more often: those with
-the greatest log-probability plus Gumbel noise (Kool, van Hoof and Welling, Stochastic Beams and Where to Find Them,
-2019).
+loss computes only the logits of the *candidates*. The first one is a draw from ``pi``, the policy that collected, and
+is taken. The loss learns from it alone (``algo.advantages=gae``), or from all (``vine``). The others are drawn without
+replacement from ``q``, which is ``pi`` at a higher temperature, so that rare choices are tried more often. They are the
+choices with the greatest log-probability plus Gumbel noise (Kool, van Hoof and Welling, Stochastic Beams and Where to
+Find Them, 2019).
 
 An expectation under the policy is estimated by a weighted mean over the candidates. The weight is the probability
-divided by the chance to be a candidate, with ``k`` the greatest noisy log-probability that is left out::
+of a choice divided by its chance to be a candidate; ``k`` is the greatest noisy log-probability that is left out::
 
     p_i = 1 - exp(-exp(log q(a_i) - k))
     w_i = pi(a_i) / (pi(a_i) + (1 - pi(a_i)) p_i), scaled to a sum of 1
@@ -18,7 +18,7 @@ The normaliser of a new policy with logits ``l`` is such an expectation, too::
     d_i = l(a_i) - log pi(a_i)
     log pi_new(a_i) = log pi(a_i) + d_i - log(sum_j w_j exp(d_j))
 
-Once every choice is a candidate, all of this is exact. With few, gradients are a little short: by up to a tenth with 9.
+If every choice is a candidate, this is exact. With few candidates, gradients are too small: by up to a tenth with 9.
 """
 
 import torch
@@ -73,11 +73,11 @@ class SampledSoftmax(Categorical):
 def draw_candidates(logits: Tensor, samples: int, temperature: float) -> tuple[Tensor, Tensor, Tensor]:
     """Draw choices, all different; return the three entries of :data:`CANDIDATE_KEYS`.
 
-    Where a mask allows too few, the taken one stands for each that is missing, with a weight of 0.
+    If a mask allows too few, the taken choice fills the missing places, with a weight of 0.
 
     Args:
         logits: of all choices, ``[N, choices]``; :data:`MASKED` for those that a mask forbids.
-        samples: candidates beside the choice that is taken; fewer if there are not so many choices.
+        samples: number of candidates beside the taken choice, at most the number of other choices.
         temperature: divides the logits for these candidates; 1: they are drawn from the policy itself.
     """
     samples = min(samples, logits.shape[1] - 1)
@@ -85,7 +85,7 @@ def draw_candidates(logits: Tensor, samples: int, temperature: float) -> tuple[T
     taken = _add_noise(every).argmax(1, keepdim=True)
     others = (every / temperature).scatter(1, taken, -torch.inf)
     scale = others.logsumexp(1, keepdim=True)
-    score, order = _add_noise(others - scale).topk(1 + samples)  # the taken one has no chance
+    score, order = _add_noise(others - scale).topk(1 + samples)  # the taken one cannot be drawn again
     candidates = torch.cat([taken, order[:, :-1]], 1)
     log_prob = every.gather(1, candidates)
     among_others = -(-(log_prob / temperature - scale - score[:, -1:]).exp()).expm1()
@@ -118,7 +118,7 @@ class CandidateLogits(TensorDictModuleBase):
 
 
 def as_sampled_actor(policy: Policy) -> ProbabilisticTensorDictSequential:
-    """Return the policy as TorchRL's losses want it, for frames with :data:`CANDIDATE_KEYS`."""
+    """Return the policy for TorchRL's losses, which reads frames with :data:`CANDIDATE_KEYS`."""
     return ProbabilisticTensorDictSequential(
         CandidateLogits(policy),
         ProbabilisticTensorDictModule(
@@ -133,11 +133,11 @@ def as_sampled_actor(policy: Policy) -> ProbabilisticTensorDictSequential:
 
 
 def as_sampling_policy(policy: Policy, samples: int, temperature: float) -> TensorDictSequential:
-    """Return the policy as the collector runs it: choice, log-probability, flat action and the candidates.
+    """Return the policy for the collector: it writes choice, log-probability, flat action and the candidates.
 
     Args:
         policy: the policy.
-        samples, temperature: as of :func:`draw_candidates`.
+        samples, temperature: as in :func:`draw_candidates`.
     """
 
     def draw(logits: Tensor) -> tuple[Tensor, ...]:

@@ -1,4 +1,4 @@
-"""TD(lambda): values of totes, from which the policy follows."""
+"""TD(lambda): values of totes, from which the policy is derived."""
 
 import torch
 from tensordict import TensorDictBase
@@ -17,7 +17,7 @@ class TD(MinibatchDescent):
     """Learn the values of the totes that placements leave, by TD(lambda) (config ``algo=td``).
 
     Args:
-        policy: one that follows from these values, and draws placements by them.
+        policy: a policy that is derived from these values, and draws placements by them.
         critic: its network, a :class:`~pickplace.policies.afterstate.value.ToteValue`.
         task: facts of the training.
         gamma: discount per step.
@@ -45,8 +45,8 @@ class TD(MinibatchDescent):
         return self.descend(with_targets(after, self.network, self.gamma, self.lmbda), at, self.objective)
 
     def objective(self, data: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the mean squared error, of the values and of all their parts, and the share of the targets' variance
-        that the values explain."""
+        """Return the mean of the squared errors of the values and of their parts; and diagnostics, such as the share of
+        the targets' variance that the values explain."""
         *entries, target = self.network.random_view(*(data[key] for key in (*self.network.in_keys, "value_target")))
         error = (target - self.network.parts(*entries)).flatten(1)
         whole, parts = error.sum(1).square().mean(), error.square().sum(1).mean()
@@ -57,7 +57,7 @@ class TD(MinibatchDescent):
 
 
 def totes_left(batch: TensorDictBase, policy: Policy) -> TensorDictBase:
-    """Return what the steps of a batch ``[N, T]`` led to, but for the items that arrived in the bin meanwhile."""
+    """Return the observations after the steps of a batch ``[N, T]``, without the items that arrived in the bin."""
     flat = batch.reshape(-1)
     left = policy.items_left(flat, flat[policy.choice_key])
     return batch["next"].copy().set("items", left.unflatten(0, batch.shape))
@@ -68,12 +68,12 @@ def with_targets(after: TensorDictBase, network: ToteValue, gamma: float, lmbda:
     """Return totes after placements with TD(lambda) targets as ``value_target``, ``[N * (T - 1)]``.
 
     A step from one afterstate to the next is the arrival of an item and its placement. Its reward is that of the
-    *next* action of the batch. Where the item that arrived has no place, the environment has ended the episode already,
-    together with the action before: the step to that end has reward 0.
+    *next* action of the batch. If the item that arrived has no place, the environment has ended the episode already,
+    with the action before. Then the step has reward 0.
 
     Args:
-        after: the afterstates ``[N, T]``, at least two of each; their rewards are not scaled.
-        network: of the values; there is a target for each of their parts.
+        after: the afterstates ``[N, T]`` with ``T >= 2``; their rewards are not scaled.
+        network: the network of the values; each part of a value has a target.
         gamma: discount per step.
         lmbda: lambda of the returns.
     """

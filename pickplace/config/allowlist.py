@@ -1,4 +1,4 @@
-"""The config of a checkpoint: what it keeps, and the allowlist of what a stranger's may make (docs/reliability.md)."""
+"""The config of a checkpoint: its saved form, and the allowlist of classes that it may make (docs/reliability.md)."""
 
 import importlib
 import inspect
@@ -26,10 +26,10 @@ RESERVED_MODULES |= sys.stdlib_module_names
 REQUIRED_KEYS = ["env._target_", "env.rotations", "env.tote_size", "items._target_", "model.actor._target_"]
 REQUIRED_KEYS += ["model.mask_infeasible", "reward_scale", "seed"]
 
-#: The groups and keys that a policy is restored from. The others are of use to the training alone.
+#: The groups and keys from which a policy is restored. Only the training uses the others.
 POLICY_GROUPS = ("env", "items", "model", "reward_scale", "seed", "device")
 
-#: Greatest depth and number of nodes of a config, and length of a text in it: more would fill the memory.
+#: Greatest depth and number of nodes of a config, and length of a text in it. A larger one could fill the memory.
 MAX_DEPTH, MAX_NODES, MAX_TEXT = 32, 50_000, 10_000
 
 #: A reference to another key of the same config, and nothing else.
@@ -42,8 +42,8 @@ def trusted_config(content: dict, trust=(), groups: Collection[str] | None = POL
     Args:
         content: the config.
         trust: modules whose classes it may make beside pickplace's own, see :func:`own_modules`.
-        groups: the groups and keys that are used, and returned; None: all. Nothing in the others is looked at, but
-            for values that these refer to.
+        groups: the groups and keys that are used and returned; None: all. The others are not checked, except for
+            values to which these refer.
 
     Raises:
         ValueError: naming the key that is missing, or refused.
@@ -92,12 +92,12 @@ def _may_be_own(module) -> bool:
 
 
 def refuse_foreign_targets(node, trust: Collection[str] = (), place: str = "", in_own: bool = False) -> None:
-    """Refuse a config that would make anything but classes of the registry, each in its place, and a user's own.
+    """Refuse a config that would make anything except classes of the registry, each in its place, and a user's own.
 
     Args:
         node: the config, or a part of it.
-        trust: modules of the user. What they define may be made in any place, out of any of pickplace's classes; they
-            are imported to know what that is.
+        trust: modules of the user. Their classes and functions may be made in any place, with any of pickplace's
+            classes as parts. The modules are imported to find them.
         place: the place of the part in the config.
         in_own: whether it is a part of something that a trusted module defines.
     """
@@ -120,7 +120,7 @@ def _module(target) -> str:
 
 
 def _advice(module: str, trust: Collection[str]) -> str:
-    """Return how to trust a module that may be the user's own; an installed package is not."""
+    """Return advice on how to trust a module, if it may be the user's own; an installed package may not."""
     if not _may_be_own(module) or module in trust or module.partition(".")[0] in packages_distributions():
         return ""
     return f"; if {module} is yours, say trust={module} (--trust {module} to pickplace-plan)"
@@ -147,7 +147,7 @@ def modules_to_trust(config) -> tuple[str, ...]:
 
 # ---------------------------------------------------------------------- references between keys, ${..actor.filters}
 def saved_form(cfg: DictConfig) -> dict:
-    """Return the config of a run as its checkpoints hold it, without ``trust``, which every reader states anew.
+    """Return the config of a run in the form of its checkpoints: without ``trust``, which every reader states anew.
 
     References to values stay, so that an override reaches both keys. Other interpolations are resolved.
     """
@@ -160,7 +160,7 @@ def saved_form(cfg: DictConfig) -> dict:
 
 
 def refuse_interpolations(root: dict) -> None:
-    """Refuse all interpolations but references to values in the same config, before anything resolves them.
+    """Refuse all interpolations except references to values in the same config, before anything resolves them.
 
     A resolver reads files and variables, or makes nodes. A reference to a part, or to another reference, could copy
     parts into parts until the memory is full.

@@ -23,11 +23,11 @@ from pickplace.common.validate import excerpt, refuse_if
 from pickplace.config.allowlist import walk
 from pickplace.config.registry import REGISTRY, names_at
 
-#: Groups whose settings in a preset belong to the experiment, so another option on the command line keeps them. Of
-#: ``KEPT`` it keeps all, of ``SHARED`` the plain values that it has itself, such as ``algo.lr``.
+#: Groups whose settings in a preset belong to the experiment. Another option on the command line keeps them: all of
+#: ``KEPT``, and of ``SHARED`` the plain values that this option has, too, such as ``algo.lr``.
 KEPT, SHARED = ("env", "evaluation"), ("algo", "model")
 
-#: Keys of Hydra's that users of the commands set.
+#: Keys of Hydra that users of the commands set.
 HYDRA_KEYS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.searchpath", "hydra.verbose")
 
 #: Sweepers and launchers of Hydra that are optional extras.
@@ -46,7 +46,7 @@ def config_files():
 
 
 def parse(words: Iterable[str]) -> list[Override]:
-    """Return the overrides that are words of a command line; a ``ValueError`` names a word that is none."""
+    """Parse words of a command line into overrides; a ``ValueError`` names a word that is not an override."""
     words = list(words)
     try:
         return OverridesParser.create().parse_overrides(words)
@@ -97,7 +97,7 @@ def compose_first_job(config_name: str, words: list[str]) -> DictConfig:
 
 
 def _refuse_hidden_files(cfg: DictConfig) -> None:
-    """Refuse an option with a file in several folders, of which Hydra takes the first without a word."""
+    """Refuse an option with a file in several folders, of which Hydra would silently take the first."""
     folders = {Path(each.path).resolve() for each in cfg.hydra.runtime.config_sources if each.schema == "file"}
     for group, choice in cfg.hydra.runtime.choices.items():
         for option in choice if OmegaConf.is_list(choice) else [choice]:
@@ -121,7 +121,7 @@ def _refuse_options_as_values(words: list[str]) -> None:
 
 
 def known_names(cfg: DictConfig) -> list[str]:
-    """Return the names that a command line may set: the keys of a config, and if it has a node ``hydra`` its groups."""
+    """Return the names that a command line may set: the keys of a config, and its groups if it has a node ``hydra``."""
     own = OmegaConf.to_container(OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"]))
     choices = OmegaConf.select(cfg, "hydra.runtime.choices") or {}
     groups = [str(group) for group in choices if not str(group).startswith("hydra/")]
@@ -134,12 +134,12 @@ def known_names(cfg: DictConfig) -> list[str]:
 
 
 def group_options(group: str, search: Iterable[str] = ()) -> list[str]:
-    """Return the names of a group's options, also those in folders of these overrides of the search path."""
+    """Return the names of a group's options, with those in folders that overrides add to the search path."""
     return GlobalHydra.instance().config_loader().get_group_options(group, overrides=list(search))
 
 
 def _first_of_sweep(words: list[str]) -> list[str]:
-    """Return overrides with the first of their values only, without those whose values cannot be listed."""
+    """Return overrides with only the first of their values. Those whose values cannot be listed are left out."""
     first = []
     for override in parse(words):
         if not override.is_sweep_override():
@@ -150,7 +150,7 @@ def _first_of_sweep(words: list[str]) -> list[str]:
 
 
 def clearer_error(error: HydraException, config_name: str, words: list[str]) -> ValueError:
-    """Return an error that names the key or the option that Hydra does not find, and those that there are."""
+    """Return an error that names the key or the option that Hydra does not find, and the known ones."""
     if isinstance(error, MissingConfigException) and (missing := error.missing_cfg_file):
         for extra in PLUGINS:
             if missing.startswith((f"hydra/sweeper/{extra}", f"hydra/launcher/{extra}")):
@@ -176,33 +176,33 @@ def search_words(words: Iterable[str]) -> list[str]:
 
 
 def refuse_unknown_keys(cfg: DictConfig, known: DictConfig, path: str = "") -> None:
-    """Refuse misspelt keys, by :func:`compose_plain`: Hydra adds any key of a preset, or after a ``+``.
+    """Refuse keys that ``known`` lacks, such as misspelt ones: Hydra adds any key of a preset, or after a ``+``.
 
     Nodes with a ``_target_`` are left to :func:`pickplace.config.registry.build`, which knows their arguments.
     """
     if f"{path}*" in REGISTRY:  # a dict of parts with names of the user's choice
         return
     for key, node in cast(dict, cfg).items():
-        if key not in known or f"{path}{key}" == "hydra":  # which is the command line's
+        if key not in known or f"{path}{key}" == "hydra":  # that node belongs to the command line
             raise ValueError(unknown_key(f"{path}{key}", known, path, () if path else known_names(known)))
         if OmegaConf.is_dict(node) and OmegaConf.is_dict(known[key]) and "_target_" not in node:
             refuse_unknown_keys(node, known[key], f"{path}{key}.")
 
 
 def own_values(cfg: DictConfig) -> DictConfig:
-    """Return the config of this run, in which an option chosen on the command line has no values of another one.
+    """Return the config of this run, in which an option chosen on the command line has no values meant for others.
 
-    Hydra merges what a preset, or a config file of the user, wrote for the option that it expected, such as
-    ``curriculum.advance.occupancy`` for ``threshold``, into the option that the command line chose instead. If the
-    group had another option without that choice, its part gets the values of the chosen option's own files, and the
-    values on the command line, but for :data:`KEPT` and :data:`SHARED`.
+    A preset, or a config file of the user, sets values for the option that it expects, such as
+    ``curriculum.advance.occupancy`` for ``threshold``. Hydra merges them into the option that the command line chose
+    instead. Here, an option that replaces another one gets the values of its own files and of the command line only.
+    :data:`KEPT` and :data:`SHARED` are exceptions.
     """
     running = HydraConfig.get()
     search = search_words(running.overrides.hydra)
     given = [(override, *_package_and_places(override, search)) for override in parse(task_overrides())]
     choices = [(each, places) for each, package, places in given if package and not each.is_delete()]
     pairs = [(place, choice) for choice, places in choices for place in places if place not in KEPT]
-    for place, choice in sorted(pairs, key=lambda pair: pair[0].count(".")):  # an outer part before its own parts
+    for place, choice in sorted(pairs, key=lambda pair: pair[0].count(".")):  # outer parts before inner ones
         if OmegaConf.select(cfg, place) is None:
             continue
         words, others = [], []  # what is changed at that place, and the other choices
@@ -230,7 +230,7 @@ def own_values(cfg: DictConfig) -> DictConfig:
 
 
 def task_overrides(hydra_cfg: Any = None) -> list[str]:
-    """Return the words of the command line; references in them stay, which lead elsewhere from there."""
+    """Return the words of the command line, with references unresolved: here they would lead elsewhere."""
     return cast(list, OmegaConf.to_container((hydra_cfg or HydraConfig.get()).overrides.task, resolve=False))
 
 
@@ -238,7 +238,7 @@ def places_in_other_groups(word: str) -> list[str]:
     """Return the places in other groups that an option sets, such as ``["env.reach"]`` for ``reach=annulus``.
 
     Raises:
-        ValueError: for one that is removed (``~reach``): nothing says what would be there instead.
+        ValueError: for an option that is removed (``~reach``), because nothing replaces it.
     """
     (override,) = parse([word])
     group = override.key_or_group
@@ -253,12 +253,12 @@ def places_in_other_groups(word: str) -> list[str]:
 
 
 def _package_and_places(override: Override, search: list[str]) -> tuple[str | None, list[str]]:
-    """Return where an override changes the config.
+    """Return the package, and the places in the config, that an override changes.
 
     Returns:
-        The package of the group if it chooses an option, ``_global_`` for presets; None if it sets a value. Then the
-        places that it changes. For a value that is its key. For an option it is the group's package, or the option's
-        keys there if the package is another group's.
+        The package of the group if the override chooses an option (``_global_`` for presets); None if it sets a value.
+        Then the changed places: for a value its key; for an option the group's package. If that is the package of
+        another group, the places are the option's keys in it.
     """
     group = override.key_or_group
     options = group_options(group, search)
@@ -282,7 +282,7 @@ def _package(group: str, options: list[str]) -> str:
 
 
 def use_whole_numbers(cfg: DictConfig) -> None:
-    """Replace numbers such as 1e5, which are floats as Hydra and YAML read them, by whole numbers.
+    """Replace numbers such as 1e5, which Hydra and YAML read as floats, by whole numbers.
 
     Those below 10 stay: nobody writes 1e0, and many settings are 1.0 or 2.0.
     """
@@ -313,7 +313,7 @@ def apply_overrides(saved: DictConfig, overrides: list[str], groups: Any = None,
         saved: the config of a checkpoint.
         overrides: as on Hydra's command line, ``key=value``; a leading ``+`` changes nothing.
         groups: composed nodes of the config groups that may be exchanged as a whole.
-        instead: what a message suggests in place of exchanging another group.
+        instead: what a message suggests instead of exchanging another group.
 
     Raises:
         ValueError: for a group that cannot be exchanged, a key that the config does not have, or a bad value.

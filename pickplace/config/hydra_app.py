@@ -49,9 +49,9 @@ class Command:
     Args:
         config_name: the file in ``conf/``.
         task: dotted path of the function. Its module, which may take seconds, is imported after all checks.
-        folders: refuses and cleans the folders of runs: :mod:`pickplace.runs.folder`.
-        from_checkpoint: groups whose keys a checkpoint brings, which ``check`` and ``task`` check.
-        check: called with the config, to refuse it.
+        folders: the module that refuses and cleans the folders of runs, :mod:`pickplace.runs.folder`.
+        from_checkpoint: groups whose keys come from a checkpoint; ``check`` and ``task`` check them.
+        check: called with the config; it may refuse it.
         after_sweep: called with the folder of a sweep, however it ends.
     """
 
@@ -122,7 +122,7 @@ class Command:
             hydra.main(version_base="1.3", config_path=str(composition.conf_dir()), config_name=self.config_name)(app)()
 
     def _run(self, merged: DictConfig, checked: DictConfig | None, words: list[str], flags: list[str]) -> None:
-        """Run the task with a checked config; without one for each job of a sweep. The folder must not be in use.
+        """Run the task with a checked config, or without one for each job of a sweep. The folder must not be in use.
 
         If one job fails, the others go on. A folder in which nothing was written is removed.
         """
@@ -139,7 +139,7 @@ class Command:
                     OmegaConf.save(cfg, run_dir / running.output_subdir / "config.yaml")
                 return getattr(import_module(module), name)(cfg, run_dir)
             except Exception as error:
-                if not is_sweep:  # raised when Hydra has ended, which would print lines of its own
+                if not is_sweep:  # raised after Hydra has ended: it would print its own lines
                     return errors.append(error)
                 self.folders.note_failure(run_dir, error)
                 log.error("run %s failed: %s", run_dir.name, sentence(error))
@@ -205,7 +205,7 @@ def show(cfg: DictConfig, options: argparse.Namespace) -> None:
 
 
 def sweep_words(merged: DictConfig, words: list[str]) -> list[str]:
-    """Return settings of Hydra's for a sweep, as overrides, by its merge of a command line and the command line."""
+    """Return Hydra's settings for a sweep, as overrides, from a command line and Hydra's merge of it."""
     logging.getLogger("alembic").setLevel(logging.WARNING)  # Optuna's database tool logs every migration
     keys = ",".join(map(composition.quoted, constant_keys(words)))
     direction = ["hydra.sweeper.direction=maximize"] if "direction" in merged.hydra.sweeper else []  # Optuna's
@@ -213,16 +213,16 @@ def sweep_words(merged: DictConfig, words: list[str]) -> list[str]:
 
 
 def constant_keys(words: list[str]) -> list[str]:
-    """Return the keys that have the same value in all runs of a sweep's command line, but for the seed."""
+    """Return the keys that have the same value in all runs of a sweep's command line, except the seed."""
     constant = [each for each in composition.parse(words) if not (each.is_hydra_override() or each.is_sweep_override())]
     return [key for each in constant if (key := each.get_key_element().lstrip("+~")) != "seed"]
 
 
 def folder_name(overrides: list[str], constant: list[str]) -> str:
-    """Return the name of the folder of a sweep's run: its overrides but for ``constant`` keys, the seed last.
+    """Return the folder name of a run in a sweep: its overrides except those of ``constant`` keys, the seed last.
 
-    The name needs no quotes in an override, which takes ``+`` and ``-``, but neither ``=`` nor ``,``. One that leaves
-    out letters, or would be too long, ends in a hash of the overrides.
+    An override takes the name without quotes: it may have ``+`` and ``-``, but neither ``=`` nor ``,``. A name that
+    leaves out characters, or would be too long, ends in a hash of the overrides.
     """
     pairs = sorted((word.lstrip("+~").partition("=")[::2] for word in overrides), key=lambda pair: pair[0] == "seed")
     pairs = [pair for pair in pairs if pair[0] not in constant] or pairs

@@ -1,9 +1,9 @@
-"""The registry: short names of all classes and functions that a config may name, and how they are called.
+"""The registry: short names of all classes and functions that a config may name, and their construction.
 
 ``_target_`` in a config holds a short name (``_target_: joint_dbl``), or the dotted path of a class of the user's own
 (``_target_: own_planner.Nearest``). A short name belongs to a place in the config, such as ``planner`` or
-``curriculum.advance``. Parts of a user's own class that are in no such place say it before the name, with slashes:
-``_target_: items/kinds``. To add an option, write its name into :data:`REGISTRY` and one file into ``conf/``.
+``curriculum.advance``. If a part of a user's own class is in no such place, the place comes before the name, with
+slashes: ``_target_: items/kinds``. To add an option, write its name into :data:`REGISTRY` and one file into ``conf/``.
 """
 
 import inspect
@@ -78,12 +78,12 @@ REGISTRY: dict[str, dict[str, str]] = {
 
 
 def build(place: str, node: DictConfig | dict, **kwargs):
-    """Make the object that a config node names, and before it the objects that nodes within it name.
+    """Make the object that a config node names. The objects of nodes within it are made first.
 
     Args:
         place: the node's place in the config, such as ``"planner"`` or ``"model.actor"``.
         node: the settings, with a ``_target_``.
-        **kwargs: arguments handed over as they are; the node may not set them.
+        **kwargs: arguments that are passed unchanged; the node may not set them.
 
     Raises:
         ValueError: for an unknown ``_target_`` or setting, or an argument that is missing; and what the constructor
@@ -110,7 +110,7 @@ def build(place: str, node: DictConfig | dict, **kwargs):
         if missing := re.search("missing .* arguments?: (.*)", str(error)):
             what = f"{place}._target_={short_text(content['_target_'])}: {missing[1]} missing"
             raise ValueError(f"{what}; expected a value, or an option of that group in the file's defaults.") from error
-        unknown = re.search("unexpected keyword argument '(.*)'", str(error))  # of what it hands its **keywords to
+        unknown = re.search("unexpected keyword argument '(.*)'", str(error))  # of a function that gets its **keywords
         if unknown and unknown[1] in settings:
             others = {key: value for key, value in settings.items() if key != unknown[1]}
             raise ValueError(unknown_key(f"{place}.{unknown[1]}", others, f"{place}.")) from error
@@ -118,7 +118,7 @@ def build(place: str, node: DictConfig | dict, **kwargs):
 
 
 def node_of(place: str, part: Any) -> Any:
-    """Return the config of a part that :func:`build` makes of it: of a dataclass its name and its settings."""
+    """Return the config from which :func:`build` makes a part: for a dataclass its name and its settings."""
     if isinstance(part, (tuple, list)):
         return [node_of(place, value) for value in part]
     if not is_dataclass(part):
@@ -135,7 +135,7 @@ def names_at(place: str) -> dict[str, str]:
 
 
 def qualified_names() -> dict[str, str]:
-    """Return all names with their places, such as ``items/kinds``, with their dotted paths."""
+    """Return the dotted paths of all names with their places, such as ``items/kinds``."""
     return {
         f"{place.removesuffix('.*').replace('.', '/')}/{name}": path
         for place, names in REGISTRY.items()
@@ -144,7 +144,7 @@ def qualified_names() -> dict[str, str]:
 
 
 def find(place: str, target) -> Callable:
-    """Return the class or function that a ``_target_`` names; a ``ValueError`` names those that there are."""
+    """Return the class or function that a ``_target_`` names; a ``ValueError`` lists the known names."""
     names = names_at(place)
     path = {**qualified_names(), **names}.get(str(target), str(target))
     module, _, name = path.rpartition(".")
@@ -166,9 +166,9 @@ def with_defaults(place: str, node: dict) -> dict:
 
 
 def accepted_arguments(function: Callable) -> list[str] | None:
-    """Return the keywords that a config may give to a class or function, or None if any.
+    """Return the keywords that a config may give to a class or function; None: any.
 
-    One with ``**keywords`` takes any. An attribute ``settings``, a tuple of names, states them instead.
+    With ``**keywords`` it takes any. An attribute ``settings``, a tuple of names, states the keywords instead.
     """
     if isinstance(settings := getattr(function, "settings", None), tuple):
         return list(settings)

@@ -36,13 +36,13 @@ class Artifacts:
         self, run_dir: Path, result: dict, cell: CellSpec, recordings: list[Recording], plans: list[EpisodePlan],
         title: str,
     ) -> None:  # fmt: skip
-        """Write the result, its table, a picture of the first tote, and what is asked for.
+        """Write the result, its table, a picture of the first tote, and the requested files.
 
         Args:
             run_dir: the folder.
             result: the content of ``evaluation.json``.
             cell: the sizes.
-            recordings: of at least one episode, and of those of the replay.
+            recordings: of at least one episode, and of all episodes of the replay.
             plans: of all episodes.
             title: of the replay page.
 
@@ -108,7 +108,7 @@ def evaluation_table(result: dict) -> str:
         "mask; candidates K": "candidates" in result
         and f"in training {training}, at decision {decision}; {result['candidates']}",
     }
-    # Names may have letters that end the cell or begin a tag.
+    # Names may have characters that end the cell or begin a tag.
     cells = [[re.sub(r"([|<])", r"\\\1", text) for text in row] for row in rows.items() if row[1]]
     name, value = (max(map(len, column)) for column in zip(*cells, strict=True))
     head, *lines = [f"| {row[0]:<{name}} | {row[1]:<{value}} |" for row in cells]

@@ -53,7 +53,7 @@ def merge_trained(cfg: DictConfig, trained: DictConfig) -> DictConfig:
 
 
 def _is_younger(key: str, groups: DictConfig, trained: DictConfig) -> bool:
-    """Return whether a checkpoint's config lacks a setting of the cell, or of items of its kind, as it is older."""
+    """Return whether an older checkpoint's config lacks a setting of the cell, or of the same kind of items."""
     group, _, name = key.partition(".")
     if group not in groups or name not in groups[group] or name in trained[group]:
         return False

@@ -76,7 +76,7 @@ def run(cfg: DictConfig, run_dir: Path) -> float:
 
 
 def prepare(cfg: DictConfig) -> tuple[MakeEnv, BatchPlanner, dict[str, Any]]:
-    """Return what a config evaluates (``conf/evaluate.yaml``): the environment's maker, the planner, and facts.
+    """Return a function that makes the environment of a config (``conf/evaluate.yaml``), the planner, and facts.
 
     The groups that a checkpoint brings are put into ``cfg``.
 
@@ -116,7 +116,7 @@ def prepare(cfg: DictConfig) -> tuple[MakeEnv, BatchPlanner, dict[str, Any]]:
 
 
 def load_trained(cfg: DictConfig) -> tuple[tuple[DictConfig, dict, dict], dict[str, Any]]:
-    """Return the parts of a checkpoint as :func:`planner_parts` wants them, and facts about its training.
+    """Return a checkpoint as the argument ``trained`` of :func:`planner_parts`, and facts about its training.
 
     The checkpoint's groups :data:`TRAINED` are put into ``cfg``, with the command line's overrides on top.
 

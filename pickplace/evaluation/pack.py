@@ -1,4 +1,4 @@
-"""Pack whole orders: a place for each item, in a sequence that is chosen, too."""
+"""Pack whole orders: choose a sequence of the items, and a place for each."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -29,13 +29,13 @@ Numbered: TypeAlias = list[tuple[int, OrderItem]]  # items with their numbers in
 Faces: TypeAlias = Sequence[tuple[str, str]]  # the orientations of each face, as it lies and turned by 90 degrees
 Variant: TypeAlias = tuple[tuple[str, str], list[int]]  # an item on one of its faces, as a row of a table of items
 
-LEAST_MARGIN = 20.0  # of an item's centre from the edge of what carries it, mm: piles are high
+LEAST_MARGIN = 20.0  # of an item's centre from the edge of its support, mm; large, as piles are high
 
-#: For each face of an item that may be the lowest one its orientations, as it lies and turned; first the one upright.
+#: Orientations of an item on each face on which it may lie, as it lies and turned by 90 degrees; first the upright one.
 FACES = tuple(zip(ORIENTATIONS[::2], ORIENTATIONS[1::2], strict=True))
 
-#: Sequences that are tried, by what comes first: the largest base, volume, height. If some item bears a limited load,
-#: also those in which what bears more comes first.
+#: Sequences that are tried: largest base first, largest volume first, greatest height first. If some item has a load
+#: limit, also each of these with the greatest limits first.
 SEQUENCES: tuple[Callable[[OrderItem], float], ...] = (
     lambda item: -item.length * item.width,
     lambda item: -item.length * item.width * item.height,
@@ -54,12 +54,12 @@ class PackedItem:
 
     @property
     def turned(self) -> bool:
-        """Whether it is turned by 90 degrees about z, after it was tipped if it was."""
+        """Whether it is turned by 90 degrees about z, after any tipping."""
         return ORIENTATIONS.index(self.orientation) % 2 == 1
 
     @property
     def size(self) -> tuple[float, float, float]:
-        """Its sides along x, y and z."""
+        """Sides along x, y and z, mm."""
         return _oriented(self.item, self.orientation)
 
 
@@ -84,15 +84,15 @@ class PackedContainer:
 class OrderPacker:
     """Packs orders into containers of one size, without a gripper.
 
-    An item lies in the corner with the least x and y of the cells that it takes. Items that carry another one together
+    Within its cells, an item lies in the corner with the least x and y. Items that carry another one together
     are level within a millimetre. Nothing sticks out of the container, or passes its rim. An item is turned only as it
     allows, and no item carries more than it bears: the full mass of an item counts on each one below it in the pile.
 
     Args:
         container: length, width and height, mm.
         cell: side of a cell of the grid, mm.
-        planner: name of what chooses a place, such as ``"joint_dbl"``: one that needs no training.
-        tipping: put items down on another side, too, where they allow it.
+        planner: name of the planner that chooses places, such as ``"joint_dbl"``; it must need no training.
+        tipping: whether to put items down on another side, too, if they allow it.
 
     Raises:
         ValueError: for a container that the grid does not divide, or a planner that does not choose among places.
@@ -130,7 +130,7 @@ class OrderPacker:
 
         Args:
             items: of an order.
-            keep_sequence: put the items down in the order's sequence, instead of the best of :data:`SEQUENCES`.
+            keep_sequence: whether to keep the order's sequence, instead of the best of :data:`SEQUENCES`.
 
         Raises:
             ValueError: for an item that fits into no container, naming its place in the file.
@@ -140,7 +140,7 @@ class OrderPacker:
         planner, left = self._make(cell), list(enumerate(items, 1))
         containers: list[PackedContainer] = []
         while left:
-            # What is tipped may stand in the way of more.
+            # Tipped items may leave less room for others.
             faces = [self._faces, self._faces[:1]] if len(self._faces) > 1 else [self._faces]
             tries = [*product([left] if keep_sequence else _sequences(left), faces)]
             tried = self._fill(cell, planner, tries, len(containers))
@@ -158,8 +158,8 @@ class OrderPacker:
         refuse_any((item for item in items if not self._variants(item, self._faces)), self._misfit)
 
     def _variants(self, item: OrderItem, faces: Faces) -> list[Variant]:
-        """Return the faces that an item may lie on in the container; and with it, as it then lies in the bin, its sides
-        in cells and millimetres, rounded up, and the bit mask of its turns.
+        """Return the faces on which an item may lie in the container, each with the columns ``w`` to ``max_load`` of an
+        :class:`Item`; w and d in cells, h in millimetres, rounded up.
 
         Args:
             faces: the orientations of each face, as it lies and turned by 90 degrees.
@@ -203,10 +203,10 @@ class OrderPacker:
     def _fill(
         self, cell: CellSpec, planner: MapPlanner, tries: Sequence[tuple[Numbered, Faces]], number: int
     ) -> list[tuple[PackedContainer, Numbered]]:
-        """Return for each try an empty container after items were put down one by one, and those that found no place.
+        """Fill an empty container for each try, item by item; return the containers, and the items that found no place.
 
         An item lies in the bin on each of its faces at once, and the planner takes one of these. The tries are problems
-        of one batch: that takes little more time than one of them.
+        of one batch, which takes little more time than a single try.
 
         Args:
             tries: the same items in a sequence, and the orientations of the faces on which they may lie.
@@ -239,7 +239,7 @@ class OrderPacker:
         self, fill: "_Filling", numbered: tuple[int, OrderItem], orientation: str, move: Move, heights: Tensor,
         bearing: Tensor,
     ) -> None:  # fmt: skip
-        """Add an item to a container, and change the height of its cells and which of them bear weight, in place.
+        """Add an item to a container; correct the heights of its cells, and whether they bear weight, in place.
 
         Args:
             numbered: the item with its number in the order.
@@ -270,7 +270,7 @@ class _Filling:
     """A container that is being filled."""
 
     recording: Recording
-    tops: np.ndarray  # of what is in it, without rounding, mm, [W_T, D_T]
+    tops: np.ndarray  # of the contents, without rounding, mm, [W_T, D_T]
     items: list[PackedItem] = field(default_factory=list)
     left: Numbered = field(default_factory=list)  # those that found no place
 

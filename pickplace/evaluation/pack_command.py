@@ -128,7 +128,7 @@ def _row(name: str, container: int, step: int, packed: "PackedItem") -> dict:
 
 
 def _text(name: str, place: int, count: int, container: "PackedContainer", rows: list[dict]) -> str:
-    """Return what is printed of a container."""
+    """Return the text that is printed for a container."""
     weight = sum(row["weight/kg"] for row in rows)
     lines = [
         f"{name}, container {place} of {count}: {len(rows)} item{'s' * (len(rows) != 1)}, "

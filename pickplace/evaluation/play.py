@@ -41,9 +41,9 @@ class Episodes:
     """Results of a planner, one entry an episode."""
 
     occupancy: Tensor  # float64 [E]
-    true_occupancy: Tensor  # float64 [E], of the true volumes, where sizes are rounded up to cells
+    true_occupancy: Tensor  # float64 [E], of the true volumes, if sizes are rounded up to cells
     items_placed: Tensor  # int64 [E]
-    num_items: Tensor  # int64 [E], that arrive in the episode; 0: they do not end
+    num_items: Tensor  # int64 [E], items that arrive in the episode; 0: without end
     failure: Tensor  # int64 [E], a Failure; NONE where the item stream ended
     final_heights: Tensor  # int32 [E, W_T, D_T]: the tote when the episode ended
     tote_height: Tensor  # int64 [E]
@@ -58,14 +58,14 @@ class _Batch:
     Args:
         env: the environment.
         first: number of the first slot's episode.
-        record, heat_maps: as of :func:`play`.
+        record, heat_maps: as in :func:`play`.
     """
 
     def __init__(self, env: PickPlaceEnv, first: int, record: Collection[int], heat_maps: Collection[int]):
         self.env, self.heat_maps = env, heat_maps
         self.running = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
         self.observation = env.reset()
-        # Entries of Episodes, of the slots that have ended.
+        # Entries of Episodes for the slots that have ended.
         self.results = {
             "tote_height": env.tote_height.clone(),
             "num_items": env.items.num_items(env.stream, env.item_seed.expand_as(env.episode), env.episode),
@@ -184,7 +184,7 @@ def play(
         batch_size: episodes played side by side. It changes no result, except with a planner that draws random
             numbers: it has one generator for all episodes of a batch.
         record: numbers of the episodes to record move by move.
-        heat_maps: those of them to record with the planner's heat maps, which take time; None: all.
+        heat_maps: numbers of recorded episodes that get the planner's heat maps, which take time; None: all.
     """
     heat_maps = record if heat_maps is None else heat_maps
     feasible, decisions = 0.0, 0
@@ -210,10 +210,10 @@ def play(
 
 @torch.no_grad()
 def decision_latency(make_env: MakeEnv, planner: BatchPlanner, decisions: int) -> dict[str, float] | None:
-    """Return the milliseconds of a decision for one tote: ``{"p50", "p95", "cpu_p50", "cpu_mean"}``; None for none.
+    """Return the milliseconds of a decision for one tote, ``{"p50", "p95", "cpu_p50", "cpu_mean"}``; None without any.
 
     The states are those of episodes. The last two figures are CPU time of all threads together, which depends little
-    on what else the machine does. A search may think long about few states, so that its mean is far above its median.
+    on other load of the machine. A search may take long in a few states, so its mean can be far above its median.
     """
     if decisions < 1:
         return None
@@ -237,7 +237,7 @@ def decision_latency(make_env: MakeEnv, planner: BatchPlanner, decisions: int) -
 
 
 def carry_out(engine: Engine, plans: Sequence[EpisodePlan], recordings: Sequence[Recording]) -> list[Outcome]:
-    """Return the outcomes of plans that a physics engine carries out, and add those of recorded episodes to them.
+    """Return the outcomes of plans that a physics engine carries out, and add them to the recordings of their episodes.
 
     Raises:
         ValueError: if the engine yields anything but an outcome for each plan.

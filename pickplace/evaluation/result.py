@@ -44,7 +44,7 @@ def confidence95(values: Tensor, least: float = 0.0, most: float = 1.0) -> tuple
 
 
 def describe(planner: BatchPlanner, facts: dict, episodes: Episodes) -> dict:
-    """Return the content of ``evaluation.json``, but for the times of decisions.
+    """Return the content of ``evaluation.json``, except the times of decisions.
 
     Args:
         planner: the planner; it may add ``statistics``.
@@ -106,7 +106,7 @@ def summarise_physics(engine: Engine, settings: dict, outcomes: Sequence[Outcome
 
 
 def proportion95(successes: int, count: int) -> tuple[float, float]:
-    """Return the 95% confidence interval of a share, by Clopper and Pearson; it has a width at 0 and at 1, too."""
+    """Return the 95% confidence interval of a share, by Clopper and Pearson. Its width is not 0 for shares 0 and 1."""
     from scipy.stats import beta
 
     low = beta.ppf(0.025, successes, count - successes + 1) if successes else 0.0
@@ -117,7 +117,7 @@ def proportion95(successes: int, count: int) -> tuple[float, float]:
 def paired_difference(result: dict, other: dict) -> dict:
     """Return the mean occupancy of a result minus that of another one, episode by episode, with its 95% interval.
 
-    Both have seen the same items, so that the difference does not depend on how hard the items are.
+    Both have the same items, so the difference does not depend on how hard the items are.
 
     Args:
         result, other: the contents of two ``evaluation.json``.
@@ -128,7 +128,7 @@ def paired_difference(result: dict, other: dict) -> dict:
 
 
 def episode_settings(cfg: DictConfig) -> dict:
-    """Return the settings that determine which episodes an evaluation plays."""
+    """Return the settings that determine the episodes of an evaluation."""
     env = {key: with_hash(value) for key, value in resolved(cfg.env).items()}
     env["support"] = node_of("env.support", read_support(build("env.support", env["support"])))  # a short form in full
     return {
@@ -149,7 +149,7 @@ def with_hash(node: Any) -> Any:
 
 
 def is_same(ours: Any, theirs: Any) -> bool:
-    """Return whether two parts of configs agree, files by content if both know it, else by path."""
+    """Return whether two parts of configs agree. Files are compared by hash if both have one, else by path."""
     if isinstance(ours, dict) and isinstance(theirs, dict):
         ignored = "path" if "sha256" in ours and "sha256" in theirs else "sha256"
         ours, theirs = ({key: node[key] for key in node if key != ignored} for node in (ours, theirs))
@@ -186,7 +186,7 @@ def read_comparison(path: Path, expected: dict, trust: Collection[str] = ()) -> 
         refuse_foreign_targets(env, trust, "env")
         other_cell = build_cell(env, reach=None)  # what is missing has its default
     reaches = ("env.reach", expected["env"].get("reach"), env.get("reach"))
-    matters = {"env.refill": cell.bin_items > 1, "env.preview": False}  # whether other items are played
+    matters = {"env.refill": cell.bin_items > 1, "env.preview": False}  # whether a difference changes the items
     for key, ours, theirs in (*differences(cell_settings(cell), cell_settings(other_cell), "env"), reaches):
         refuse_if(
             not is_same(ours, theirs) and matters.get(key, True),

@@ -1,4 +1,4 @@
-"""The protocol of planners, and what several of them do."""
+"""The protocol of planners, and functions that several planners share."""
 
 from abc import ABC, abstractmethod
 from typing import Protocol, runtime_checkable
@@ -18,10 +18,10 @@ class BatchPlanner(Protocol):
     """Decides where to pick, where to place and how to turn, for ``N`` problems at once.
 
     A planner is made as ``Planner(cell, ...)``. A class attribute ``needs`` names further arguments that pickplace
-    hands over: ``"items"`` (the item distribution), ``"terms"`` (of the observation), ``"policy"`` and ``"critic"`` (of
+    passes: ``"items"`` (the item distribution), ``"terms"`` (of the observation), ``"policy"`` and ``"critic"`` (of
     the checkpoint).
 
-    Optional methods: ``evaluation_facts() -> dict`` describes the planner in ``evaluation.json`` (of a policy:
+    Optional methods: ``evaluation_facts() -> dict`` describes the planner in ``evaluation.json`` (for a policy:
     ``candidates`` and ``mask_at_decision``), ``statistics() -> dict`` adds figures to it after the episodes, and
     ``heat_map(observation) -> [N, W_T, D_T]`` adds a picture to a replay.
 
@@ -36,11 +36,11 @@ class BatchPlanner(Protocol):
 
 
 class MapPlanner(ABC):
-    """A planner that chooses among the actions that given maps allow, so that it serves a robot, too.
+    """A planner that chooses among the actions that given maps allow. So it also serves a robot.
 
     Attributes:
         cell: the sizes.
-        name: as of :class:`BatchPlanner`.
+        name: as in :class:`BatchPlanner`.
     """
 
     name: str
@@ -48,13 +48,13 @@ class MapPlanner(ABC):
 
     @abstractmethod
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
-        """Return flat actions, int64 ``[N]``, feasible ones where there are any.
+        """Return flat actions, int64 ``[N]``, feasible ones if there are any.
 
         Args:
-            cell: the sizes; for a robot heights are counted in another unit, and there may be limits.
+            cell: the sizes; for a robot with another unit of heights, and perhaps with limits.
             state: heights in that unit.
-            maps: what decides which actions succeed.
-            observation: what a policy sees, in the height units of its training.
+            maps: determine which actions succeed.
+            observation: the input of a policy, in the height units of its training.
         """
 
     @torch.no_grad()
@@ -68,14 +68,14 @@ ITEM_RULES = ("any", "first", "nearest")
 
 
 def restrict_items(cell: CellSpec, rule: str, state: State, mask: Tensor) -> Tensor:
-    """Return a mask of choices in which one item of each bin is left, the first by a rule that has any choice.
+    """Return a mask of the choices of one item in each bin: the first item, by a rule, that has any choice.
 
     Args:
-        cell: with its ``tipping`` all poses of the item are left.
+        cell: the sizes; with ``tipping`` the choices of all poses of the item stay.
         rule: ``"first"``: in the order of arrival; ``"nearest"``: by the distance of the item's centre from the bin's
             origin; ``"any"``: the mask stays as it is.
         state: has the items.
-        mask: bool ``[N, M * C]``, those of an item side by side.
+        mask: bool ``[N, M * C]``, the choices of an item side by side.
     """
     if rule == "any":
         return mask
@@ -89,9 +89,9 @@ def restrict_items(cell: CellSpec, rule: str, state: State, mask: Tensor) -> Ten
 
 
 def narrow_first(cell: CellSpec, item: Item, values: Tensor) -> Tensor:
-    """Return values of choices ``[N, M * Q * W_T * D_T]`` with each item's narrower side along x first.
+    """Return values of choices ``[N, M * Q * W_T * D_T]``, reordered: each item's narrower side along x comes first.
 
-    So an order of choices does not depend on how the items lie in the bin. The function is its own inverse.
+    So the order does not depend on how the items lie in the bin. The function is its own inverse.
 
     Args:
         cell: the sizes.
@@ -105,7 +105,7 @@ def narrow_first(cell: CellSpec, item: Item, values: Tensor) -> Tensor:
 
 
 def first_choice(cell: CellSpec, maps: PlacingMaps, order: Tensor) -> Tensor:
-    """Return the choice of least order, int64 ``[N]``; ties go to the first item, narrower side along x, then x and y.
+    """Return the choice with the least order, int64 ``[N]``; ties: first item, narrower side along x, least x, least y.
 
     Args:
         order: of the choices, ``[N, M * Q * W_T * D_T]``.
@@ -116,15 +116,15 @@ def first_choice(cell: CellSpec, maps: PlacingMaps, order: Tensor) -> Tensor:
 
 
 def pick_first(cell: CellSpec, maps: PlacingMaps, rule: str) -> tuple[Tensor, Tensor, Tensor]:
-    """Return a pick that does not look at the tote, and what can be done with it.
+    """Return a pick that does not look at the tote, and the placements with it.
 
     Args:
         maps: of one item in each bin.
         rule: a key of :data:`~pickplace.rules.grasps.PICKS`.
 
     Returns:
-        the pick cell, int64 ``[N]``; and of every place and rotation, ``[N, W_T * D_T * R]``, the item's footprint,
-        int64, and whether it succeeds, bool.
+        the pick cell, int64 ``[N]``; and for every place and rotation, ``[N, W_T * D_T * R]``, the item's
+        footprint, int64, and whether it succeeds, bool.
     """
     pick = PICKS[rule](cell, maps.item, maps.blocked)
     footprint = action_footprints(cell, maps.item.rows((slice(None), None)), maps.blocked)

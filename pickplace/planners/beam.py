@@ -16,16 +16,16 @@ from pickplace.rules.masks import PlacingMaps, first_action_reaching, placing_ma
 from pickplace.rules.state import State
 from pickplace.rules.step import put_down
 
-CELLS_AT_ONCE = 2**23  # of totes that are judged at a time
+CELLS_AT_ONCE = 2**23  # cells of the totes that are judged at a time
 
 
 class _Plans(NamedTuple):
-    """Sequences of choices, those of a problem side by side."""
+    """Plans, each a sequence of choices; the plans of a problem are side by side."""
 
-    problem: Tensor  # int64 [P], of which problem
-    first: Tensor  # int64 [P], the first choice of each; -1: none yet
-    placed: Tensor  # int64 [P], the volume that they place
-    total: Tensor  # float32 [P], with the value of what they leave
+    problem: Tensor  # int64 [P], number of the problem
+    first: Tensor  # int64 [P], the first choice; -1: none yet
+    placed: Tensor  # int64 [P], the placed volume
+    total: Tensor  # float32 [P], the scaled placed volume plus the value of the state after it
     state: State  # of P problems
 
     def rows(self, index: Tensor) -> "_Plans":
@@ -36,18 +36,18 @@ class _Plans(NamedTuple):
 class Beam(MapPlanner):
     """Plans the placements of several items that are seen, and plays the first one of the best plan.
 
-    At each depth every plan goes on with every item that is left, at every place that the policy ranks; those with the
-    greatest sum of placed volume and value of what they leave are kept (beam search, Lowerre 1976). Plans that leave
-    the same tote and the same items are one. Items that are seen to come arrive in their order; the others are not
-    imagined: they are part of the value. A plan is worth no more than what it places if all that it leaves is known to
-    fit nowhere. Where one item alone is seen it decides as the policy does.
+    At each depth, every plan is extended by every item that is left, at every place that the policy ranks. The plans
+    with the greatest sum of placed volume and value of the state after it are kept (beam search, Lowerre 1976). Plans
+    that lead to the same tote and the same items count as one. Items in the preview arrive in their order. Later items
+    are not imagined: they are part of the value. If all items that a plan leaves are known to fit nowhere, it is worth
+    only the volume that it places. If a single item is seen, it decides like the policy.
 
     Args:
         cell: the sizes.
         policy: ``afterstate`` or ``afterstate_fcn``.
-        width: plans that are kept at each depth.
-        depth: placements of a plan.
-        budget: milliseconds after which a decision goes no deeper; None: always to the depth.
+        width: number of plans that are kept at each depth.
+        depth: number of placements of a plan.
+        budget: milliseconds after which a decision goes no deeper; None: no limit.
     """
 
     name = "beam"
@@ -78,30 +78,30 @@ class Beam(MapPlanner):
                 break
             plans = self._longer(plans, mask)
             is_last = depth + 1 == self.depth or self._is_late(start, depth + 1)
-            if is_last and plans.state.coming is None:  # whether what arrives fits is part of the value
+            if is_last and plans.state.coming is None:  # the value includes whether new items fit
                 break
             mask = self.policy.ranked(placing_maps(self.cell, plans.state))
         problem, first, _, total = map(torch.cat, zip(*(part[:4] for part in [*ended, plans]), strict=True))
-        choice = first[_greatest(problem, total, 1)].clamp(min=0)  # as a policy that has no choice
+        choice = first[_greatest(problem, total, 1)].clamp(min=0)  # like a policy without a feasible choice
         return first_action_reaching(cell, maps, choice)
 
     def evaluation_facts(self) -> dict:
-        return {"candidates": "all", "mask_at_decision": True}  # as a policy's planner
+        return {"candidates": "all", "mask_at_decision": True}  # like planner=policy
 
     def _without_choice(self, plans: _Plans) -> _Plans:
-        """Return plans that cannot go on; if no item arrives that may save them, the value of what they leave is 0."""
+        """Return plans that cannot go on. The value of their state is 0 unless an unseen item may still fit."""
         placed = plans.placed * self.policy.value_network().reward_scale
         return plans._replace(total=torch.where(awaits_unseen(self.cell, plans.state), plans.total, placed))
 
     def _is_late(self, start: float, depth: int) -> bool:
-        """Return whether one more placement, if it takes as long as those before it, would pass the budget."""
+        """Return whether one more placement, if it takes as long as those before it, would exceed the budget."""
         return self.budget is not None and (perf_counter() - start) * 1000 * (depth + 1) / depth > self.budget
 
     def _longer(self, plans: _Plans, mask: Tensor) -> _Plans:
-        """Return the best plans of each problem that are one placement longer.
+        """Return the best plans of each problem with one more placement.
 
         Args:
-            mask: bool ``[P, choices]``, with which choices each plan may go on; there is one at least.
+            mask: the choices by which each plan may be extended, at least one in all, bool ``[P, choices]``.
         """
         row, choice = mask.nonzero(as_tuple=True)
         at_once = max(
@@ -113,16 +113,15 @@ class Beam(MapPlanner):
         kept = different[_greatest(plans.problem[row[different]], total[different], self.width)]
         row, choice = row[kept], choice[kept]
         first = torch.where(plans.first[row] < 0, choice, plans.first[row])
-        # The states of all plans would not fit into the memory; those of the kept ones are made again.
+        # The states of all plans would not fit into the memory; those of the kept ones are computed again.
         after, _ = put_down(self.cell, plans.state.rows(row), choice)
         return _Plans(plans.problem[row], first, placed[kept], total[kept], let_in(self.cell, after))
 
     def _judge(self, plans: _Plans, row: Tensor, choice: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return for plans that go on with a choice the volume placed, the total, and a number that is the same for
-        those that lead to the same, ``[C]`` each.
+        """Return the placed volume, the total and the :func:`_fingerprint` of plans extended by a choice, ``[C]`` each.
 
         Args:
-            row, choice: int64 ``[C]``.
+            row, choice: the plan and the choice, int64 ``[C]``.
         """
         after, volume, value = self.policy.judge(plans.state.rows(row), choice)
         placed = plans.placed[row] + volume
@@ -134,8 +133,7 @@ class Beam(MapPlanner):
 
 
 def _greatest(problem: Tensor, total: Tensor, count: int) -> Tensor:
-    """Return the rows with the ``count`` greatest totals of each problem, those of a problem side by side; of equals
-    the first.
+    """Return the rows with the ``count`` greatest totals of each problem, grouped by problem; among equals the first.
 
     Args:
         problem: int64 ``[P]``.
@@ -149,15 +147,15 @@ def _greatest(problem: Tensor, total: Tensor, count: int) -> Tensor:
 
 
 def _first_of_each(value: Tensor) -> Tensor:
-    """Return the rows of int64 ``[P]`` whose value is in no row before them, in their order."""
+    """Return the first row of each distinct value in int64 ``[P]``, in ascending order."""
     values, same = value.unique(return_inverse=True)
     number = torch.arange(len(value), device=value.device)
     return number.new_full(values.shape, len(value)).scatter_reduce(0, same, number, "amin").sort().values
 
 
 def _fingerprint(problem: Tensor, state: State) -> Tensor:
-    """Return a number for each of ``P`` states, int64 ``[P]``: equal for equal problems, totes, loads that they bear,
-    sets of items in the bin and items that come, and different for others but for one pair in 2**64."""
+    """Return a hash of each of ``P`` states, int64 ``[P]``. It is equal for equal problems, totes, loads that they can
+    still bear, sets of items in the bin, and items to come. Other pairs of states are equal with probability 2**-64."""
     table = state.items.table
     each = _mixed(_weighted(table)) * state.items.exists
     maps = [state.surface] if state.pile is None else [state.surface, state.pile.capacity]
@@ -173,7 +171,7 @@ def _weighted(numbers: Tensor) -> Tensor:
 
 
 def _mixed(number: Tensor) -> Tensor:
-    """Return whole numbers whose bits all depend on all bits of the given ones, int64 (Stafford's mix of 2011)."""
+    """Return hashes of whole numbers, int64: each bit depends on all bits of the number (Stafford's mix, 2011)."""
     for shift, factor in ((30, -0x40A7B892E31B1A47), (27, -0x6B2FB644ECCEEE15), (31, 1)):
         number = (number ^ (number >> shift & (1 << 64 - shift) - 1)) * factor
     return number

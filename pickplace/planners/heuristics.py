@@ -24,7 +24,7 @@ from pickplace.rules.state import State
 
 
 def dbl_order(cell: CellSpec, top: Tensor) -> Tensor:
-    """Return a number that orders footprints by (top, y, x): deepest-bottom-left has the least one.
+    """Return a number that orders footprints by (top, y, x): the deepest-bottom-left one has the least.
 
     Args:
         cell: the sizes.
@@ -38,7 +38,7 @@ def dbl_order(cell: CellSpec, top: Tensor) -> Tensor:
 
 
 class UniformRandom:
-    """Uniform over all ``N_a`` flat actions, feasible or not: the policy with which training without a mask begins.
+    """Draws uniformly among all ``N_a`` flat actions, feasible or not, like a policy before training without a mask.
 
     Args:
         cell: the sizes.
@@ -56,7 +56,7 @@ class UniformRandom:
 
 
 class RandomFeasible(MapPlanner):
-    """Uniform over the feasible flat actions.
+    """Draws uniformly among the feasible flat actions.
 
     Args:
         cell: the sizes.
@@ -88,9 +88,9 @@ class RandomFeasible(MapPlanner):
 
 
 class _Cheapest(MapPlanner):
-    """Chooses the footprint of least cost over everything that is feasible.
+    """Chooses the feasible footprint with the least cost.
 
-    Ties go to the first of several items, to its narrower side along x, to the least x, then y; then to the lowest flat
+    Ties are decided in this order: the first item, its narrower side along x, the least x, the least y, the lowest flat
     index. So it does not matter how an item lies in the bin.
     """
 
@@ -119,8 +119,7 @@ class JointDBL(_Cheapest):
 
     Args:
         cell: the sizes.
-        item: which of several items in the bin are considered, see
-            :func:`~pickplace.planners.base.restrict_items`.
+        item: rule that selects the items to consider, see :func:`~pickplace.planners.base.restrict_items`.
     """
 
     name = "joint_dbl"
@@ -140,8 +139,7 @@ class Corner(_Cheapest):
     Args:
         cell: the sizes.
         height_weight: cost of one height unit, in cells of distance.
-        item: which of several items in the bin are considered, see
-            :func:`~pickplace.planners.base.restrict_items`.
+        item: rule that selects the items to consider, see :func:`~pickplace.planners.base.restrict_items`.
     """
 
     name = "corner"
@@ -163,8 +161,7 @@ class HeightmapMinimisation(_Cheapest):
     Args:
         cell: the sizes.
         distance_weight: cost of one cell of distance from the tote's origin, in cells times height units.
-        item: which of several items in the bin are considered, see
-            :func:`~pickplace.planners.base.restrict_items`.
+        item: rule that selects the items to consider, see :func:`~pickplace.planners.base.restrict_items`.
     """
 
     name = "heightmap_minimisation"
@@ -182,21 +179,20 @@ class HeightmapMinimisation(_Cheapest):
 
 
 class IndividualHeuristic(MapPlanner):
-    """A pick that does not look at the tote, then deepest-bottom-left over the corners of the tote's free rectangles.
+    """Picks without a look at the tote, then places deepest-bottom-left in the corners of the tote's free rectangles.
 
-    A candidate is a footprint in a corner of a maximal rectangle (MaxRects, Jylanki 2010) of the cells that are not
-    higher than the level on which the item would rest; the first in the order (top, footprint y, footprint x) that
-    succeeds in a forward simulation is played; ties go to the item's narrower side along x, then to the lowest flat
-    index. If none does, the first is played, and fails.
+    Free cells are those that are not higher than the level on which the item would rest. A candidate is a footprint in
+    a corner of a maximal rectangle of free cells (MaxRects, Jylanki 2010). The candidates are tried in a forward
+    simulation, in the order (top, footprint y, footprint x), and the first that succeeds is played. Ties go to the
+    item's narrower side along x, then to the lowest flat index. If none succeeds, the first is played, and fails.
 
     Of several items in the bin it takes the first that can be picked.
 
     Args:
         cell: the sizes.
         candidates: ``"corners"``, or ``"cells"`` for every footprint.
-        item: which item is the first: ``"first"``, the one that arrived first, or ``"nearest"``, the one nearest to the
-            bin's origin.
-        pick: which pick of it: ``"least_offset"``, the paper's (:func:`~pickplace.rules.grasps.heuristic_pick`), or
+        item: order of the items: ``"first"``, by arrival, or ``"nearest"``, by the distance from the bin's origin.
+        pick: pick of the item: ``"least_offset"``, the paper's (:func:`~pickplace.rules.grasps.heuristic_pick`), or
             ``"middle"``, the one nearest to the middle of the item.
     """
 
@@ -227,9 +223,9 @@ class IndividualHeuristic(MapPlanner):
 
 
 def corner_footprints(cell: CellSpec, heights: Tensor, maps: PlacingMaps) -> Tensor:
-    """Return which footprints lie in a corner of a maximal free rectangle of their level, bool ``[N, Q, W_T, D_T]``.
+    """Mask of the footprints in a corner of a maximal free rectangle of their level, bool ``[N, Q, W_T, D_T]``.
 
-    Free on a level are the cells that are not higher than it; a footprint's level is the height on which it rests.
+    The free cells of a level are those that are not higher. A footprint's level is the height on which it rests.
 
     Args:
         heights: int32 ``[N, W_T, D_T]``.
@@ -256,14 +252,14 @@ def _least_corners(free: Tensor, w: Tensor, d: Tensor) -> Tensor:
     """Return the cells at which a maximal rectangle of free cells, at least ``w x d``, begins, bool ``[N, W, D]``."""
     tote_w, tote_d = free.shape[1:]
     x = torch.arange(tote_w, device=free.device)[:, None]
-    # How many cells are free from each one on along x; the same in the row before; is the cell before it not free?
+    # Number of free cells from each cell on along x; the same in the row before; whether the cell before is not free.
     run = torch.where(free, tote_w, x).flip(1).cummin(1).values.flip(1) - x
     before = F.pad(run[:, :, :-1], (1, 0))
     blocked_left = F.pad(~free[:, :-1], (0, 0, 1, 0), value=True)
-    # Of the rectangles that begin at a cell, the widest of every depth; each is maximal if no side can move outwards.
+    # For each depth, the widest rectangle that begins at a cell; it is maximal if no side can move outwards.
     corner, width, closed = torch.zeros_like(free), run, blocked_left
     for depth in range(1, tote_d + 1):
-        longer = torch.minimum(width, F.pad(run[:, :, depth:], (0, depth)))  # the width that one row more would leave
+        longer = torch.minimum(width, F.pad(run[:, :, depth:], (0, depth)))  # the width with one row more
         fits = (width >= w) & (d <= depth)
         corner |= fits & closed & (before < width) & (longer < width) & (width > 0)
         width, closed = longer, closed | F.pad(blocked_left[:, :, depth:], (0, depth))

@@ -22,25 +22,26 @@ from pickplace.rules.step import put_down
 class Lookahead(MapPlanner):
     """Plays out the policy's most probable choices, and departs from the policy only where a gain is certain enough.
 
-    Each candidate is followed by the policy itself, on the same imagined item streams as the others (common random
-    numbers), so that their difference is known far better than their values. More streams are spent where candidates
-    are close. The policy's own choice stands unless another's mean difference to it is positive by ``confidence``
-    standard errors: a rollout algorithm (Tesauro & Galperin 1996) that the items' noise cannot make worse than its
-    policy, to that confidence. A critic that errs could, where the policy fills nearly all: what wins by its judgement
-    must gain without it too, both played out to the end; unless the policy itself follows from the critic. The imagined
-    items come from the item distribution, never from the stream that is played; the first of all streams are spread
-    over its kinds, so that with as many streams as kinds their mean is exact. What lies in the bin already, or is seen
-    to come, is known, and played out before them.
+    After each candidate the policy itself decides, on the same imagined item streams for all (common random numbers).
+    So their differences are known far better than their values. Close candidates get more streams. The policy's own
+    choice stands unless another one is better by ``confidence`` standard errors of the mean difference. This is a
+    rollout algorithm (Tesauro & Galperin 1996): to that confidence, the items' noise cannot make it worse than its
+    policy. The critic's error could, where the policy fills nearly all. So a gain that the critic predicts must be
+    confirmed by playing both choices out to the end, unless the policy itself is derived from the critic.
+
+    Imagined items come from the item distribution, never from the stream that is played. The first items of all streams
+    are spread over its kinds, so with as many streams as kinds their mean is exact. The items in the bin and in the
+    preview are known, and played out before them.
 
     Args:
         cell: the sizes.
         policy: ``fcn_grasp`` or ``afterstate``, trained with a mask.
-        items: the item distribution; of a sequence, recorded or cut, its sizes, equally likely.
-        candidates: how many of the policy's most probable choices are played out.
-        critic: the value of a state, a function from observations to ``[N, 1]``, in volume; None: there is none.
+        items: the item distribution; for a sequence, recorded or cut, its sizes with equal probability.
+        candidates: number of the policy's most probable choices that are played out.
+        critic: a function from observations to values ``[N, 1]``, in volume; None: there is none.
         terms: of the observation, by key; None: the standard ones.
-        horizon: items after which the critic judges the state; None, or without a critic: played out to the end.
-        samples: imagined streams in the first round, each later round doubles them; and of what is played to the end.
+        horizon: number of items after which the critic judges the state; None, or without a critic: to the end.
+        samples: number of imagined streams in the first round, and to confirm a gain; each later round doubles it.
         rounds: the greatest number of rounds.
         confidence: standard errors by which a candidate must beat the policy's choice.
         seed: of the imagined items.
@@ -86,20 +87,20 @@ class Lookahead(MapPlanner):
             state.surface.device,
         )
         logits = self.policy.footprint_logits(observation, self.policy.with_cell(cell).ranked(maps))
-        # Of equals the first, as the policy itself plays.
+        # Among equals the first, like the policy itself.
         value, choice = (part[:, : self.candidates] for part in logits.sort(dim=1, descending=True, stable=True))
         best = self._best(State.from_observation(observation), choice, value > MASKED / 2)
         return first_action_reaching(cell, maps, choice.gather(1, best[:, None])[:, 0])
 
     def evaluation_facts(self) -> dict:
-        return {"candidates": "all", "mask_at_decision": True}  # as a policy's planner
+        return {"candidates": "all", "mask_at_decision": True}  # like planner=policy
 
     def _best(self, state: State, choice: Tensor, open_: Tensor) -> Tensor:
-        """Return which candidate to play, int64 ``[N]``.
+        """Return the number of the candidate to play, int64 ``[N]``.
 
         Args:
             choice: int64 ``[N, M]``, footprints; the policy's own choice is the first.
-            open_: bool ``[N, M]``, which may be played.
+            open_: mask of the candidates that may be played, bool ``[N, M]``.
         """
         total = torch.zeros(choice.shape, dtype=torch.float64, device=choice.device)  # of the differences to the first
         squares, count = torch.zeros_like(total), torch.zeros_like(total)
@@ -141,10 +142,10 @@ class Lookahead(MapPlanner):
         return best.index_put((row,), torch.where(volume[1::2] > volume[::2], best[row], 0))
 
     def _returns(self, state: State, row: Tensor, choice: Tensor, streams: int, horizon) -> Tensor:
-        """Return the volume that choices place, and the policy after them, float64 ``[M, streams]``.
+        """Return the volume placed by choices and by the policy after them, float64 ``[M, streams]``.
 
         Args:
-            row, choice: int64 ``[M]``, of which problem, and which footprint.
+            row, choice: the problem and the footprint, int64 ``[M]``.
             streams, horizon: as in :meth:`_play_out`.
         """
         state, placed = put_down(self.cell, state.rows(row), choice)
@@ -155,8 +156,8 @@ class Lookahead(MapPlanner):
 
         Args:
             state: of ``M`` problems, before items arrive.
-            problem: int64 ``[M]``; equal ones meet equal items.
-            horizon: items after which the critic judges the state; None: played out to the end.
+            problem: int64 ``[M]``; equal ones get equal items.
+            horizon: number of items after which the critic judges the state; None: played out to the end.
         """
         cell, policy, critic_keys = self.cell, self.policy, getattr(self.critic, "in_keys", ())
         # A critic that does not see the bin values what a placement leaves, before the next item arrives.
@@ -168,7 +169,7 @@ class Lookahead(MapPlanner):
         seed = problem * 1_000_003 + self._decisions * 7_919 + self.seed
         volume = torch.zeros(len(problem), dtype=torch.float64, device=problem.device)
         arrived, row = torch.zeros_like(problem), torch.arange(len(problem), device=problem.device)
-        # Items are spread only where the next one lies alone in the bin: with several, nobody has measured it.
+        # Items are spread only if the bin holds one: with several, the effect has not been measured.
         source = _Imagined(self.items, streams) if cell.bin_items == 1 else self.items
         for step in itertools.count():
             if step == horizon and judges_before:
@@ -197,7 +198,7 @@ class Lookahead(MapPlanner):
 
 
 class _Imagined(ItemDistribution):
-    """The items of imagined streams, of which the first ones are spread over the distribution.
+    """The items of imagined streams. The first items are spread over the distribution.
 
     Args:
         items: the item distribution.

@@ -35,11 +35,11 @@ _Tote: TypeAlias = tuple[Tensor, Tensor, Pile | None, Tensor | None]
 
 @dataclass(eq=False)
 class _Node:
-    """A tote, and what lies in the bin."""
+    """A tote, and the items in the bin."""
 
     surface: Tensor  # int32 [W_T, D_T], of the tote
     items: Tensor  # int64 [M, 9], a table
-    untried: list[int] | None  # actions in random order, of which the last comes first; None: all N_a flat actions
+    untried: list[int] | None  # actions in random order, taken from the end; None: all N_a flat actions
     edges: dict[int, "_Edge"] = field(default_factory=dict)
     pile: Pile | None = None  # of the items in the tote, see State
     coming: Tensor | None = None  # int64 [p, 9], a table of those that arrive next, see State
@@ -51,37 +51,37 @@ class _Node:
 
 @dataclass(eq=False)
 class _Edge:
-    """An action at a node, and the bins that were sampled to come after it."""
+    """An action at a node, and the bins that were sampled after it."""
 
     node: _Node
     action: int
     visits: int = 0
     total: float = 0.0  # of the returns
-    volume: int = 0  # that the action places
-    left: "_Tote | None" = None  # None until simulated, and if it fails
+    volume: int = 0  # placed by the action
+    left: "_Tote | None" = None  # after the action; None until it is simulated, and if it fails
     failed: bool = False
     bins: list[_Node] = field(default_factory=list)
-    is_known: bool = False  # whether all items of the bin after it are seen, so that there is one such bin
+    is_known: bool = False  # whether all items of the next bin are seen, so that there is only one such bin
 
 
 class MCTS(MapPlanner):
     """UCT with decision nodes and sampled bin nodes, and uniform rollouts; the most visited action is played.
 
     Each simulation walks down by UCB1, tries one action that has not been tried, samples the bin that arrives, and
-    plays uniformly at random to the end. An action's bins are sampled from the item distribution, ``visits **
-    widening`` of them at most, so that the tree grows deeper than one step; the stream that is played is never looked
-    up. Of several items in the bin, those that were not taken stay there. Simulations advance together on the
-    environment's rules; those of one wave see each other's visits, but not yet their returns.
+    plays uniformly at random to the end. At most ``visits ** widening`` bins after an action are sampled from the item
+    distribution, so that the tree grows deeper than one step. The stream that is played is never used. Items that were
+    not taken stay in the bin. Simulations advance together on the environment's rules; those of one wave see each
+    other's visits, but not yet their returns.
 
     Args:
         cell: the sizes.
-        items: the item distribution; of a sequence, recorded or cut, its sizes, equally likely.
-        simulations: for each decision.
+        items: the item distribution; for a sequence, recorded or cut, its sizes with equal probability.
+        simulations: number of simulations for each decision.
         mask: search among the distinct footprints that some action reaches; False: among all ``N_a`` flat actions,
             as in the paper, in the tree and in the rollouts.
         exploration: weight of UCB1's second term; returns are shares of the tote's volume.
         widening: exponent of the number of bins sampled after an action.
-        wave: simulations that advance together, over all problems.
+        wave: number of simulations that advance together, over all problems.
         seed: of the search.
     """
 
@@ -142,9 +142,9 @@ class MCTS(MapPlanner):
         return {"mean_tree_depth": self._depths / max(self._walks, 1)}
 
     def _walk_down(self, root: _Node) -> tuple[list[_Edge], bool]:
-        """Return the edges from the root on, which count the visit; and whether the last bin's item fits nowhere.
+        """Walk down from the root and count visits; return the edges, and whether the walk ended without an action.
 
-        If it does not, the walk ends with an action whose effect, or whose next bin, must be found out.
+        Otherwise it ended with an action whose effect, or whose next bin, must be simulated.
         """
         node, path = root, []
         while (edge := self._choose(node)) is not None:
@@ -158,7 +158,7 @@ class MCTS(MapPlanner):
         return path, edge is None
 
     def _choose(self, node: _Node) -> _Edge | None:
-        """Return an action that was not tried, if any, else the most promising by UCB1; None if there is none."""
+        """Return the edge of an untried action, if any, else the most promising one by UCB1; None without actions."""
         action = None
         if node.untried:
             action = node.untried.pop()
@@ -215,7 +215,7 @@ class MCTS(MapPlanner):
         return after, step.item, step.failure == 0
 
     def _nodes(self, state: State, mask: Tensor | None = None) -> list[_Node]:
-        """Return new nodes, with the actions to try: those of a mask, or that the rules allow."""
+        """Return new nodes with the actions to try: those of a mask, or those that the rules allow."""
         if self.mask and mask is None:
             mask = choice_mask(self.cell, placing_maps(self.cell, state))
         untried: Sequence = [None] * len(state.surface)
@@ -229,9 +229,9 @@ class MCTS(MapPlanner):
         return [_Node(*tote[:2], actions, pile=tote[2], coming=tote[3]) for tote, actions in totes]
 
     def _arrive(self, state: State) -> tuple[State, Tensor]:
-        """Return the states after items have arrived, and in which of them all were seen to come, bool ``[M]``.
+        """Return the states after items have arrived, and a mask of those in which all items were seen, bool ``[M]``.
 
-        Those that were not seen come from the item distribution, each drawn once.
+        Unseen items come from the item distribution, with one draw for each state.
         """
         state = let_in(self.cell, state)
         rows = awaits_unseen(self.cell, state)

@@ -23,13 +23,12 @@ class PolicyPlanner(MapPlanner):
     Args:
         cell: the sizes.
         policy: a policy made for this cell.
-        candidates: ``K``, how many of the most probable flat actions, over all ``N_a`` and without a mask, are tried;
-            if none succeeds the most probable one is played, and fails. ``"all"`` plays the best feasible one.
-        item: which of several items in the bin are considered, see
-            :func:`~pickplace.planners.base.restrict_items`.
-        pick: ``"any"``; or a pick that is chosen first, without a look at the tote, of one item in the bin:
-            ``"least_offset"`` or ``"middle"``, as of ``individual_heuristic``. Then only the footprints that it reaches
-            are considered; if it reaches none, an action is played that fails.
+        candidates: ``K``, number of the most probable flat actions, of all ``N_a`` and without a mask, that are tried.
+            If none succeeds, the most probable one is played, and fails. ``"all"`` plays the best feasible one.
+        item: rule that selects the items to consider, see :func:`~pickplace.planners.base.restrict_items`.
+        pick: ``"any"``; or, for bins with one item, a rule that chooses the pick first, without a look at the tote:
+            ``"least_offset"`` or ``"middle"``, as in ``individual_heuristic``. Then only the footprints that this pick
+            reaches are considered. If it reaches none, an action is played that fails.
     """
 
     name = "policy"
@@ -59,7 +58,7 @@ class PolicyPlanner(MapPlanner):
 
     @torch.no_grad()
     def rank(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Ranking:
-        """Return the choices that it considers with their scores; arguments as of :meth:`choose`."""
+        """Return the choices that it considers with their scores; arguments as in :meth:`choose`."""
         policy = self.policy.with_cell(cell)
         if self.pick != "any":
             pick, footprint, succeeds = pick_first(cell, maps, self.pick)
@@ -99,8 +98,8 @@ class PolicyPlanner(MapPlanner):
     def heat_map(self, observation: Observation) -> Tensor:
         """Return the policy's greatest probability over picks and rotations for each place cell, ``[N, W_T, D_T]``.
 
-        With ``candidates="all"`` only feasible actions count, as it chooses among those, and of a pick that is chosen
-        first only its own.
+        With ``candidates="all"`` only feasible actions count, and if a pick is chosen first, only the actions of that
+        pick.
         """
         cell = self.cell
         score = self.policy.action_log_probs(observation).exp()

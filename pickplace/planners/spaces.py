@@ -1,8 +1,8 @@
 """Planners that set items down at the origins of maximal empty spaces, as the packing heuristics of the literature do.
 
-A *maximal empty space* is a space above the items, open to the top, that cannot grow: a rectangle of cells no higher
-than its floor, one of which is as high, with something higher, or a wall, along each side. Its origin is its cell with
-the least x and y.
+A *maximal empty space* is a space above the items, open to the top, that cannot grow. Its base is a rectangle of cells
+that are no higher than its floor, and at least one of them is as high. Along each side of the rectangle is something
+higher, or a wall. Its origin is its cell with the least x and y.
 """
 
 from abc import abstractmethod
@@ -22,8 +22,8 @@ from pickplace.rules.maps import FAR
 from pickplace.rules.masks import PlacingMaps, action_mask, choice_mask, first_action_reaching
 from pickplace.rules.state import State
 
-LAST = FAR**2  # order of a footprint at the origin of no space
-CELLS_AT_ONCE = 2**18  # that are looked at together, over all floors
+LAST = FAR**2  # order of a footprint that is not at the origin of a space
+CELLS_AT_ONCE = 2**18  # cells that are processed together, over all floors
 
 
 class Spaces(NamedTuple):
@@ -38,11 +38,11 @@ class Spaces(NamedTuple):
 
 
 def empty_spaces(heights: Tensor, level_step: int = 0) -> Spaces:
-    """Return the maximal empty spaces of totes; some come up more than once.
+    """Return the maximal empty spaces of totes; some may appear more than once.
 
     Args:
         heights: int32 ``[N, W_T, D_T]``.
-        level_step: by how much the heights of a level surface may differ.
+        level_step: greatest difference between the heights of a level surface.
     """
     wide, deep = heights.shape[1:]
     levels = heights.flatten(1).sort(1).values
@@ -56,8 +56,8 @@ def empty_spaces(heights: Tensor, level_step: int = 0) -> Spaces:
 def _spaces_on(heights: Tensor, row: Tensor, floor: Tensor, level_step: int) -> Spaces:
     """Return the maximal empty spaces with given floors, ``[F]``, in the totes of given numbers.
 
-    Such a space is as deep as the run of free cells along y from some cell of its first row: no deeper rectangle there
-    is free. To both sides it goes to where a run is shorter. That leaves the side of least y to be looked at.
+    Along y, such a space is as deep as the shortest run of free cells from its first row. Along x, it extends to both
+    sides until a run is shorter. So only the side of least y remains to be checked.
     """
     heights, level = heights[row], floor[:, None, None]
     (wide, deep), y = heights.shape[1:], torch.arange(heights.shape[2], device=heights.device, dtype=torch.int32)
@@ -77,7 +77,7 @@ def _spaces_on(heights: Tensor, row: Tensor, floor: Tensor, level_step: int) -> 
 
 
 def _reach(run: Tensor) -> Tensor:
-    """Return over how many cells of less x, one after the other, runs are no shorter, int64 of the same shape."""
+    """Return the number of successive cells towards x = 0 whose runs are no shorter, int64 of the same shape."""
     reach, going = torch.zeros_like(run, dtype=torch.int64), run > 0
     for step in range(1, run.shape[1]):
         going = going[:, 1:] & (run[:, :-step] >= run[:, step:])
@@ -88,17 +88,16 @@ def _reach(run: Tensor) -> Tensor:
 
 
 class SpacePlanner(MapPlanner):
-    """Sets the item down at the origin of the empty space that comes first in an order of the planner's own.
+    """Sets the item down at the origin of the empty space that is first in the planner's order.
 
     Minimises (:meth:`space_order`, footprint y, footprint x) over all feasible footprints that begin in the origin of a
     maximal empty space. Ties go to the item's narrower side along x, then to the lowest flat index.
 
     Args:
         cell: the sizes.
-        item: which of several items in the bin are considered, see
-            :func:`~pickplace.planners.base.restrict_items`.
-        dbl_fallback: where no item fits at the origin of a space: whether deepest-bottom-left decides over all feasible
-            footprints. Else an action is played that fails, and ends the episode, as in the literature.
+        item: rule that selects the items to consider, see :func:`~pickplace.planners.base.restrict_items`.
+        dbl_fallback: whether deepest-bottom-left decides over all feasible footprints if no item fits at the origin of
+            a space. Else an action is played that fails, and ends the episode, as in the literature.
 
     Raises:
         ValueError: for settings of other types.
@@ -134,7 +133,8 @@ class SpacePlanner(MapPlanner):
         return torch.where(has_origin[:, 0], action, action_mask(cell, maps).int().argmin(1))
 
     def _least_order(self, cell: CellSpec, state: State, maps: PlacingMaps) -> Tensor:
-        """Return the least order of a space at whose origin a footprint lies, int64 ``[N * M, Q, W_T, D_T]``."""
+        """Return for each footprint the least order of a space at whose origin it lies, else :data:`LAST`, int64
+        ``[N * M, Q, W_T, D_T]``."""
         spaces, item, bins = empty_spaces(state.heights, maps.level_step), state.items.flatten(), maps.bin_items
         order = torch.full((len(item.w), cell.parities, *cell.tote_size[:2]), LAST, device=item.w.device)
         row, floor, x0, y0, x1, y1 = (part[:, None] for part in spaces)
@@ -152,8 +152,8 @@ class SpacePlanner(MapPlanner):
 
 
 class BestFit(SpacePlanner):
-    """Fills the lowest maximal empty space that the item fits best: with the least rest along x or y, whichever is
-    less."""
+    """Fills the lowest maximal empty spaces first; of these the one with the fewest cells left along x or y, whichever
+    is less."""
 
     name = "best_fit"
 

@@ -1,4 +1,4 @@
-"""Making of a planner's arguments from a config and a checkpoint, and checked calls of planners."""
+"""Arguments of planners from a config and a checkpoint, and checked calls of planners."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -23,15 +23,15 @@ def decide(
     """Return a planner's flat actions, int64 ``[N]``.
 
     Args:
-        choose: a function of the observation to call in place of the planner's ``decide``.
+        choose: a function of the observation to call instead of the planner's ``decide``.
 
     Raises:
-        ValueError: for anything else, naming the planner's class and what its ``decide`` returned or raised.
+        ValueError: for any other result or error, naming the planner's class and what ``decide`` returned or raised.
         FloatingPointError: for a policy whose scores are not finite.
     """
     try:
         action, count = (choose or planner.decide)(observation), len(observation["bin_depth"])
-    except (ValueError, FloatingPointError, TimeoutError):  # each says enough
+    except (ValueError, FloatingPointError, TimeoutError):  # their messages say enough
         raise
     except Exception as error:
         raise ValueError(f"{type(planner).__name__}.decide failed: {sentence(error)}") from error
@@ -56,7 +56,7 @@ def planner_parts(
     terms: Mapping[str, Term],
     trained: tuple[DictConfig, dict, dict] | None = None,
 ) -> dict[str, Any]:
-    """Return the arguments of a config's planner beside its settings.
+    """Return the arguments that a planner needs beside the settings of its config.
 
     Args:
         planner: a config of the group ``planner``.

@@ -1,7 +1,7 @@
-"""The abstract policy, and how TorchRL sees it.
+"""The abstract policy, and its forms for TorchRL.
 
-A policy chooses among *choices*: flat actions, or classes of flat actions that it has no reason to tell apart. The
-probability of a choice is spread evenly over the flat actions of its class, so that PPO's ratio and entropy are those
+A policy chooses among *choices*. A choice is a flat action, or a class of flat actions that the policy treats alike.
+The probability of a choice is spread evenly over the flat actions of its class. So PPO's ratio and entropy are those
 of the choice.
 """
 
@@ -33,8 +33,8 @@ from pickplace.rules.masks import PlacingMaps, action_mask
 from pickplace.rules.observation import item_keys, standard_terms
 from pickplace.rules.state import State
 
-#: The logit of what must not be chosen, far below what a network may score: its probability is exactly 0 in float32.
-#: The rest of float32's range is left for differences from the greatest logit.
+#: Logit of a forbidden choice: far below any score of a network, so its probability is exactly 0 in float32. The rest
+#: of float32's range is left for differences from the greatest logit.
 MASKED = -1e38
 
 #: Greatest number of parameters of a network; with gradients and Adam's moments each takes 16 bytes.
@@ -62,26 +62,26 @@ class Policy(TensorDictModuleBase, ABC):
 
     Args:
         cell: the sizes.
-        masks: masks that the environment must emit for training it, of ``"action"``, ``"footprint"`` and ``"corner"``.
+        masks: masks that the environment must emit in training: any of ``"action"``, ``"footprint"`` and ``"corner"``.
 
     Attributes:
         choice_key: name of the choice in the TensorDict.
         masks: the masks among :attr:`in_keys`.
         in_keys: entries of the observation that :meth:`logits` reads.
         map_keys: entries of the observation that its network reads.
-        excludes: what :meth:`action_log_probs` gives probability 0 by construction; None if nothing.
-        any_bin: whether its network scores bins of any size, or those of its cell only.
-        least_tote: fewest cells along a side of a tote that an exported network takes.
+        excludes: names the actions to which :meth:`action_log_probs` always gives probability 0; None: there are none.
+        any_bin: whether its network scores bins of any size; else those of its cell only.
+        least_tote: least number of cells along a side of a tote that an exported network accepts.
 
     Raises:
-        ValueError: as of :meth:`check_cell`.
+        ValueError: see :meth:`check_cell`.
     """
 
     choice_key: str = "action"
     map_keys: tuple[str, ...] = DEPTH_KEYS
     excludes: str | None = None
     any_bin: bool = True
-    least_tote: int = 3  # the rules look at a square of the longest item's side, which is mostly 3
+    least_tote: int = 3  # the rules look at squares of the longest item's side, usually 3
     network: Any
 
     def __init__(self, cell: CellSpec, masks: Sequence[str] = ()):
@@ -104,7 +104,7 @@ class Policy(TensorDictModuleBase, ABC):
     def choice_logits(self, observation: Observation, choices: Tensor) -> Tensor:
         """Return the logits of some choices that a mask allows, ``[N, M]``, up to a constant for each row.
 
-        A policy overrides this where it need not compute all logits for it.
+        A policy overrides this if it can compute them without all the other logits.
 
         Args:
             observation: as for :meth:`logits`.
@@ -113,11 +113,11 @@ class Policy(TensorDictModuleBase, ABC):
         return self.logits(observation).gather(1, choices)
 
     def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
-        """Return a flat action of each choice's class, int64 ``[N]``; drawn evenly when exploring, else the lowest."""
+        """Return a flat action for each choice, int64 ``[N]``: drawn evenly if exploring, else its class's lowest."""
         return choice
 
     def to_choice(self, action: Tensor, observation: Observation) -> Tensor:
-        """Return the class of each flat action, int64 ``[N]``; the action must succeed."""
+        """Return the choice to which each flat action belongs, int64 ``[N]``; the action must succeed."""
         return action
 
     @abstractmethod
@@ -134,20 +134,20 @@ class Policy(TensorDictModuleBase, ABC):
     def rank(self, observation: Observation, maps: PlacingMaps) -> "Ranking":
         """Return the feasible choices with their scores.
 
-        If a policy has probability for none of the feasible ones, its most probable action is the best, and fails.
+        If all feasible choices have probability 0, the most probable action counts as the best one, and fails.
 
         Args:
-            observation: what the networks see.
-            maps: what decides which actions are feasible.
+            observation: the input of the networks.
+            maps: determine which actions are feasible.
         """
         score = self.action_log_probs(observation)
         return rank_actions(torch.where(action_mask(self.cell, maps), score, score - FAR))
 
     def with_cell(self, cell: CellSpec) -> Self:
-        """Return this policy, with the same networks, for a cell with other limits, or another number of items.
+        """Return this policy for a cell with other limits or another number of items. It shares the networks.
 
         Raises:
-            ValueError: as of :meth:`check_cell`.
+            ValueError: see :meth:`check_cell`.
         """
         self.check_cell(cell)
         other = copy(self)
@@ -156,11 +156,11 @@ class Policy(TensorDictModuleBase, ABC):
         return other
 
     def item_keys(self, cell: CellSpec) -> tuple[str, ...]:
-        """Return the entries of the observation that list items, of those that it reads."""
+        """Return the entries of the observation that list items and that the policy reads."""
         return item_keys(cell.bin_items)
 
     def act(self, choice: Tensor, *values: Tensor) -> Tensor:
-        """Return :meth:`to_action` for the entries :attr:`act_keys` of an observation, in that order."""
+        """Return :meth:`to_action` of an observation given as the values of :attr:`act_keys`, in that order."""
         return self.to_action(choice, dict(zip(self.act_keys, values, strict=True)))
 
     @property
@@ -169,23 +169,23 @@ class Policy(TensorDictModuleBase, ABC):
         return list(dict.fromkeys([*standard_terms(self.cell), *self.in_keys]))
 
     def learning_bytes(self, samples: int | None = None) -> int:
-        """Return about how many bytes a frame takes in a gradient step; with ``fcn_grasp`` 90 kB at the paper's cell.
+        """Return the approximate bytes of a frame in a gradient step; with ``fcn_grasp`` 90 kB at the paper's cell.
 
         Args:
-            samples: choices in each frame whose logits are computed beside the taken one; None: all.
+            samples: number of choices in each frame whose logits are computed, beside the taken one; None: all.
         """
         return 1_250 * self.cell.num_choices
 
     @property
     def acting_bytes(self) -> int:
-        """About how many bytes a problem takes when a choice is drawn."""
+        """Approximate bytes of a problem when a choice is drawn."""
         return 40 * self.cell.num_choices
 
     def check_sizes(self) -> list[str]:
         """Check the paper's conditions on sizes in training: eq. 2 on the items, eq. 3 on the bin and the tote.
 
         Returns:
-            A sentence for each condition that is not met; the policy can be trained all the same.
+            A sentence for each condition that is not met; the policy can still be trained.
         """
         field = getattr(getattr(self, "network", None), "receptive_field", None) or 0
         side = self.cell.longest_side or self.cell.max_side
@@ -201,7 +201,7 @@ class Policy(TensorDictModuleBase, ABC):
 
 
 class ActionPolicy(Policy):
-    """Chooses among all ``N_a`` flat actions, by a score for each.
+    """Chooses among all ``N_a`` flat actions by their scores.
 
     Args:
         cell: the sizes.
@@ -213,7 +213,7 @@ class ActionPolicy(Policy):
 
     @abstractmethod
     def action_scores(self, observation: Observation, mask: Tensor | None = None) -> Tensor:
-        """Return logits ``[N, N_a]``; with a mask, bool ``[N, N_a]``, :data:`MASKED` where it forbids an action."""
+        """Return logits ``[N, N_a]``; :data:`MASKED` where a mask, bool ``[N, N_a]``, forbids the action."""
 
     def logits(self, observation: Observation) -> Tensor:
         return self.action_scores(observation, observation["action_mask"] if self.masks else None)
@@ -227,36 +227,37 @@ class ActionPolicy(Policy):
 
 @runtime_checkable
 class EstimatesValue(Protocol):
-    """A policy that follows from the value of states: its network is the critic, too, and learns by TD(lambda)."""
+    """A policy that is derived from values of states: its network is also the critic, and learns by TD(lambda)."""
 
     def value_network(self) -> torch.nn.Module:
-        """Return the module from the entries of the observation in its ``in_keys`` to values ``[..., 1]``.
+        """Return the module that maps the entries of the observation in its ``in_keys`` to values ``[..., 1]``.
 
-        ``algo=td`` wants a :class:`~pickplace.policies.afterstate.value.ToteValue`, whose parts it learns.
+        ``algo=td`` needs a :class:`~pickplace.policies.afterstate.value.ToteValue`: it learns the parts of the value.
         """
 
     def items_left(self, observation: Observation, choice: Tensor) -> Tensor:
         """Return the items that are seen after a choice, before others arrive, int64 ``[N, M + p, 5]``."""
 
     def judge(self, before: State, choice: Tensor) -> tuple[State, Tensor, Tensor]:
-        """Return what choices lead to before others arrive, the volumes that they place, int64 ``[N]``, and the values
-        of what they leave, float32 ``[N]``, scaled as the network's.
+        """Return the states after choices and before items arrive, the volumes placed, int64 ``[N]``, and the values of
+        these states, float32 ``[N]``, in the scale of the network.
 
         Args:
             before: the states.
-            choice: int64 ``[N]``, ``item * num_footprints + footprint``, feasible ones.
+            choice: feasible choices, int64 ``[N]``: ``item * num_footprints + footprint``.
         """
 
 
 @runtime_checkable
 class ScoresFootprints(Protocol):
-    """A policy that chooses among all footprints that some action reaches, or among those of them that it ranks."""
+    """A policy that chooses among the footprints that some action reaches, or among a part of them."""
 
     def ranked(self, maps: PlacingMaps) -> Tensor:
-        """Return the footprints among which it chooses, bool ``[N, M * Q * W_T * D_T]``; some, if any is feasible."""
+        """Return a mask of the footprints to choose among, bool ``[N, M * Q * W_T * D_T]``; at least one if any is
+        feasible."""
 
     def footprint_logits(self, observation: Observation, mask: Tensor) -> Tensor:
-        """Return logits of the footprints, float32 in the shape of the mask; :data:`MASKED` where it forbids one."""
+        """Return logits of the footprints, float32 in the shape of the mask; :data:`MASKED` where it is false."""
 
 
 @runtime_checkable
@@ -264,7 +265,7 @@ class ScoresActions(Protocol):
     """A policy whose network scores flat actions one by one."""
 
     def action_scores(self, observation: Observation, mask: Tensor | None = None) -> Tensor:
-        """Return logits, float32 ``[N, N_a]``; with a mask of that shape, :data:`MASKED` where it forbids an action."""
+        """Return logits, float32 ``[N, N_a]``; :data:`MASKED` where a mask of that shape forbids the action."""
 
 
 @runtime_checkable
@@ -272,9 +273,9 @@ class ScoresAnySize(Protocol):
     """A policy that scores bins and totes of any size, so that its network can be exported.
 
     Attributes:
-        score_index: how an index of the scores is made.
+        score_index: formula of an index of the scores.
         any_bin: whether bins may have any size; else totes only.
-        least_tote: fewest cells along a side of a tote.
+        least_tote: least number of cells along a side of a tote.
     """
 
     score_index: str
@@ -282,8 +283,8 @@ class ScoresAnySize(Protocol):
     least_tote: int
 
     def unmasked_scores(self, observation: Observation) -> Tensor:
-        """Return the score of everything that it scores, feasible or not, float32 ``[N, scores]``; it reads the entries
-        ``in_keys`` but for the masks."""
+        """Return the scores of all actions or footprints, feasible or not, float32 ``[N, scores]``; it reads the
+        entries ``in_keys`` except the masks."""
 
 
 class Choice(Categorical):
@@ -312,7 +313,7 @@ def refuse_several_items(policy: Policy, cell: CellSpec) -> None:
 
 
 def best_choice(scores: Tensor) -> Tensor:
-    """Return the choice of greatest score, int64 ``[N]``, of scores ``[N, choices]``; errors as of
+    """Return the choice with the greatest score, int64 ``[N]``, given scores ``[N, choices]``; errors: see
     :func:`check_finite`."""
     return check_finite(scores).argmax(1)
 
@@ -366,12 +367,12 @@ def refuse_large_network(make: Callable[[], torch.nn.Module], key: str) -> None:
 
 
 def as_critic(critic: torch.nn.Module) -> ValueOperator:
-    """Return a value network as TorchRL wants it; it reads the entries of the observation in its ``in_keys``."""
+    """Return a value network as a module of TorchRL; it reads the entries of the observation in its ``in_keys``."""
     return ValueOperator(critic, list(getattr(critic, "in_keys", DEPTH_KEYS)))
 
 
 def as_actor(policy: Policy) -> ProbabilisticTensorDictSequential:
-    """Return the policy as TorchRL's losses want it: observation -> ``logits`` -> a choice and its log-probability."""
+    """Return the policy for TorchRL's losses: observation -> ``logits`` -> a choice and its log-probability."""
     return ProbabilisticTensorDictSequential(
         policy,
         ProbabilisticTensorDictModule(
@@ -386,7 +387,7 @@ def as_actor(policy: Policy) -> ProbabilisticTensorDictSequential:
 
 
 def as_collection_policy(policy: Policy) -> TensorDictSequential:
-    """Return the policy as the collector runs it: choice, log-probability and flat action; logits are dropped."""
+    """Return the policy for the collector: it writes choice, log-probability and flat action, but no logits."""
     keys = list(dict.fromkeys([policy.choice_key, "log_prob", "action"]))
     return TensorDictSequential(as_actor(policy), act_module(policy), selected_out_keys=keys)
 

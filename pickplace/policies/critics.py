@@ -1,4 +1,4 @@
-"""Value networks. They share nothing with the policies; acting needs none, but ``planner=lookahead`` asks one."""
+"""Value networks, separate from the policies. They are not needed to act, except by ``planner=lookahead``."""
 
 import math
 
@@ -18,11 +18,11 @@ from pickplace.rules.observation import item_keys
 
 
 class Pooled(nn.Module):
-    """The critic beside ``fcn_grasp``: the volume that each column of the tote will still take, summed.
+    """The critic of ``fcn_grasp``: the sum of the volumes that the columns of the tote will still take.
 
-    A convolution over the one-hot clipped tote (a cell outside it is in no plane), the item's size added, then ``1x1``
-    layers that estimate for each cell which share of its unclipped depth will be filled, and a correction. The sum over
-    the cells is the value, so that one set of weights serves any tote.
+    A convolution sees the clipped tote, one-hot (a cell outside it is in no plane). The item's size is added. For each
+    cell, ``1x1`` layers then estimate the share of its unclipped depth that will be filled, and a correction. The value
+    is the sum over the cells, so one set of weights serves any tote.
 
     Args:
         cell: the sizes.
@@ -30,12 +30,12 @@ class Pooled(nn.Module):
         receptive_field: side of the square that is seen around a cell, odd; cells.
         hidden: width of the 1x1 layer before the output.
         tote_clip, depth_range, item_range, compute_dtype: as in :class:`FootprintFcn`; depths in levels.
-        level: height units that one level of depth spans; depths and the item's height are rounded down to levels.
-        stride: of the convolution, in cells; on fine grids not every column need be looked at.
+        level: height units in one level of depth; depths and the item's height are rounded down to levels.
+        stride: of the convolution, in cells; more than 1 skips columns, for fine grids.
 
     Shapes:
-        ``bin_depth [..., W_B, D_B]``, ``tote_depth`` and ``tote_bearing [..., W_T, D_T]``, and of several items in the
-        bin ``items [..., M, 5]``, of which it sees the mean -> ``[..., 1]``.
+        ``bin_depth [..., W_B, D_B]``, ``tote_depth`` and ``tote_bearing [..., W_T, D_T]`` -> ``[..., 1]``. With several
+        items in the bin also ``items [..., M, 5]``, of whose codes it sees the mean.
     """
 
     any_size = True
@@ -92,7 +92,7 @@ class Pooled(nn.Module):
 
     @staticmethod
     def keys_for(bin_items: int) -> tuple[str, ...]:
-        """Return the entries of the observation to read where a bin holds so many items."""
+        """Return the entries of the observation to read for bins with this number of items."""
         return (*MAP_KEYS, *item_keys(bin_items))
 
     def _item_code(self, items: Item) -> Tensor:
@@ -104,19 +104,19 @@ class Pooled(nn.Module):
 class Conv4d(nn.Module):
     """The value of a state, by a network that shares nothing with the policy.
 
-    The paper only says that the value function has its own network with a fully connected end; everything
-    else here is a choice. Running the policy's 4D layers once more would double the cost of an update, so
-    each map, clipped and padded as for the policy, passes two 2D convolutions of ``filters`` ``3x3``, each
-    with a ReLU; all of it, with the mean and the greatest *unclipped* remaining depth of the tote (the
-    clipped map hides how much is left, and the return depends on it), passes a hidden layer with a ReLU and a
-    linear output. The fully connected end ties it to one bin and tote size; acting needs no value.
+    The paper only says that the value function has its own network with a fully connected end. The rest is our
+    choice. The policy's 4D layers would double the cost of an update. So each map, clipped and padded as for the
+    policy, passes two 2D convolutions of ``filters`` ``3x3``, each with a ReLU. A hidden layer with a ReLU and a linear
+    output follow. The hidden layer also sees the mean and the greatest *unclipped* remaining depth of the tote: the
+    clipped map hides how much is left, and the return depends on it. The fully connected end ties the network to one
+    size of bin and tote.
 
     Args:
         cell: the sizes.
         filters: channels of the 2D convolutions.
         hidden: width of the fully connected layer.
         bin_clip, tote_clip, floor: as in :class:`~pickplace.policies.fcn4d.network.Conv4dNet`.
-        depth_scale: the two unclipped figures are divided by it.
+        depth_scale: divisor of the two unclipped depths.
         compute_dtype: of all but the last layer, as in :class:`~pickplace.policies.fcn4d.network.Conv4dNet`.
     """
 

@@ -9,7 +9,7 @@ from pickplace.rules.item import Item
 
 
 class Contents(NamedTuple):
-    """The items in the bins, and for each footprint that is scored the number of its item."""
+    """The items in the bins, and the number of the item of each footprint that is scored."""
 
     items: Item  # [N, M]
     number: Tensor  # int64, one for each footprint that is scored
@@ -30,10 +30,10 @@ class Contents(NamedTuple):
 def clip_depth(depth: Tensor, limit: float | None, floor: float | None = None) -> Tensor:
     """Shift each depth map down until nothing in it is greater than ``limit`` (depth clipping, eq. 4).
 
-    ``s - max(max(s) - limit, 0)``, the inner maximum over the whole map of one environment. Differences
-    between cells are kept, only the greatest value is bounded, so that a policy serves any tote height. What
-    lies further than ``limit`` below the maximum goes negative, as eq. 4 has it; ``floor`` (not in the paper)
-    clamps it.
+    The result is ``s - max(max(s) - limit, 0)``; the inner maximum is over the whole map of one environment.
+    Differences between cells stay the same, and only the greatest value is bounded. So a policy serves any tote
+    height. Cells further than ``limit`` below the maximum become negative, as in eq. 4; ``floor`` (not in the
+    paper) clamps them.
 
     Args:
         depth: ``[..., W, D]``; every leading dimension is a batch dimension.

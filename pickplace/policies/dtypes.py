@@ -1,4 +1,4 @@
-"""Types of the matrix products in networks; parameters stay float32."""
+"""Dtypes of the matrix products in networks; parameters stay float32."""
 
 import torch
 
@@ -6,7 +6,7 @@ DTYPES = ("auto", "float32", "bfloat16")
 
 
 def matrix_dtype(name: str, device: str) -> torch.dtype:
-    """Return the type of matrix products on a type of device; for ``"auto"`` the fastest one there.
+    """Return the dtype of matrix products on a type of device; ``"auto"``: the fastest one there.
 
     A processor without units for bfloat16 takes up to 40 times as long with it.
     """

@@ -1,7 +1,7 @@
-"""The bases of policies that choose among footprints.
+"""Base classes of policies that choose among footprints.
 
-A success leaves a tote that depends on the footprint alone; the grasp only decides whether it can be reached, and the
-mask knows that. Where bins hold several items, a choice is a pair of an item and a footprint, with the index
+After a success, the tote depends on the footprint alone. The grasp only decides whether the footprint can be reached,
+and the mask knows that. Where bins hold several items, a choice is a pair of an item and a footprint, with the index
 ``item * num_footprints + footprint``.
 """
 
@@ -28,7 +28,7 @@ from pickplace.rules.placing import unchecked_top
 from pickplace.rules.state import State
 from pickplace.rules.step import apply
 
-#: How an index of the scores of all footprints is made.
+#: Formula of an index of the scores of all footprints.
 FOOTPRINT_INDEX = (
     "(parity * W_T + x) * D_T + y: first cell of the item in the tote; parity 1: turned by 90 degrees; of several "
     "items one after the other"
@@ -36,24 +36,25 @@ FOOTPRINT_INDEX = (
 
 
 def count_ways(choices: int, footprint: Tensor, allowed: Tensor) -> Tensor:
-    """Return how many of the allowed actions, bool ``[N, A]``, leave each footprint, int64 ``[N, choices]``.
+    """Return the number of allowed actions that leave each footprint, int64 ``[N, choices]``.
 
     Args:
         choices: the number of footprints, over all items in a bin.
         footprint: int64 ``[N, A]``, the footprint that each action leaves, or -1.
+        allowed: bool ``[N, A]``.
     """
     return footprint.new_zeros(len(footprint), choices + 1).scatter_add_(1, footprint + 1, allowed.long())[:, 1:]
 
 
 def rank_footprints(cell: CellSpec, maps: PlacingMaps, scores: Tensor) -> Ranking:
-    """Return the ranking of footprints by their scores, float32 ``[N, footprints]``, with the first action to each."""
+    """Return the ranking of footprints by their scores, float32 ``[N, footprints]``, each with its first action."""
     best = first_action_reaching(cell, maps, best_choice(scores))
     return Ranking(best, scores, lambda row, choice: first_action_reaching(cell, maps.rows(row), choice))
 
 
 def every_footprint(tote_depth: Tensor, parities: int) -> tuple[Tensor, Tensor]:
     """Return row and index of every footprint of totes ``[N, W_T, D_T]``, int64 ``[N * parities * W_T * D_T]`` each."""
-    batch, wide, long = tote_depth.shape  # not len(), of which torch.export would make a constant
+    batch, wide, long = tote_depth.shape  # not len(), which torch.export would turn into a constant
     row, footprint = (torch.arange(size, device=tote_depth.device) for size in (batch, parities * wide * long))
     return row[:, None].expand(batch, footprint.shape[0]).flatten(), footprint.expand(batch, -1).flatten()
 
@@ -63,7 +64,7 @@ class FootprintScorer(Policy):
 
     Args:
         cell: the sizes.
-        mask_infeasible: must be true, as the choices come from what is feasible.
+        mask_infeasible: must be true, because the choices come from a mask.
         **network: arguments of the network.
 
     Attributes:
@@ -88,11 +89,11 @@ class FootprintScorer(Policy):
             self.network = self.network_class(**network)
 
     def scores(self, observation: Observation, row: Tensor, footprint: Tensor) -> Tensor:
-        """Return the scores of some footprints, float32 ``[M]``; a subclass may add what further terms tell.
+        """Return the scores of some footprints, float32 ``[M]``; a subclass may use further terms of the observation.
 
         Args:
             row: int64 ``[M]``, index of the problem.
-            footprint: int64 ``[M]``, index ``(parity * W_T + x) * D_T + y``; of several items that of a choice.
+            footprint: int64 ``[M]``, index ``(parity * W_T + x) * D_T + y``; with several items, index of the choice.
         """
         bins, totes, bearing = (observation[key] for key in MAP_KEYS)
         places = self.cell.parities * totes.shape[1] * totes.shape[2]
@@ -100,8 +101,8 @@ class FootprintScorer(Policy):
         return self.network.at(bins, totes, bearing, row, footprint - contents.number * places, contents)[:, 0]
 
     def footprint_logits(self, observation: Observation, mask: Tensor) -> Tensor:
-        """Return logits of the footprints that a mask ``[N, M * Q * W_T * D_T]`` allows; the others are not
-        computed."""
+        """Return logits of footprints, computed only where a mask ``[N, M * Q * W_T * D_T]`` allows them; else
+        :data:`MASKED`."""
         row, footprint = mask.nonzero(as_tuple=True)
         scores = self.scores(observation, row, footprint)
         return scores.new_full(mask.shape, MASKED).index_put((row, footprint), scores)
@@ -124,7 +125,7 @@ class FootprintScorer(Policy):
 
 
 class FootprintPolicy(FootprintScorer):
-    """Chooses among the footprints that its mask allows; arguments as of :class:`FootprintScorer`."""
+    """Chooses among the footprints that its mask allows; arguments as in :class:`FootprintScorer`."""
 
     mask = "footprint"
     excludes: str | None = "failed picks and footprints outside the tote"
@@ -136,7 +137,7 @@ class FootprintPolicy(FootprintScorer):
         return self.footprint_logits(observation, observation[f"{self.mask}_mask"])
 
     def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
-        maps = placing_maps(self.cell, State.from_observation(observation), unchecked_top)  # the mask has looked
+        maps = placing_maps(self.cell, State.from_observation(observation), unchecked_top)  # the mask has checked
         return pick_one(actions_reaching(self.cell, maps, choice))
 
     def action_log_probs(self, observation: Observation) -> Tensor:

@@ -17,10 +17,10 @@ from pickplace.policies.base import ScoresAnySize
 from pickplace.policies.restore import TrainedPolicy, cell_settings, load_policy
 
 TOLERANCE = 5e-5  # greatest difference between onnxruntime and torch, as a share of the greatest score
-#: Cells by which the totes, and the bins, of the check are larger than those of the training.
+#: Numbers of cells by which the totes, and the bins, of each check are larger than in training.
 CHECKS = (((1, 4), (0, 0)), ((3, 0), (0, 0)), ((7, 5), (1, 2)))
 ENVS, STEPS = 3, 8  # each check has ENVS * STEPS problems at most
-MOST_FOOTPRINTS = 2_000  # of all problems of a check together, but for one problem: on a fine grid each takes seconds
+MOST_FOOTPRINTS = 2_000  # of all problems of a check, if these are more than one: on a fine grid each takes seconds
 
 N = Dim("N")
 
@@ -45,8 +45,8 @@ def export_onnx(checkpoint, path, trust: Sequence[str] = (), **sizes) -> dict[tu
     """Write the scoring network of a checkpoint as an ONNX model, if onnxruntime agrees with torch about it.
 
     Its inputs are entries of the observation, by their names; its output ``logits``, float32 ``[N, scores]``, has the
-    unmasked score of every footprint, or of every flat action. The metadata says how an index is made. Matrix products
-    are those of float32.
+    unmasked score of every footprint, or of every flat action. The metadata has the formula of an index. Matrix
+    products are computed in float32.
 
     Args:
         checkpoint, trust, **sizes: see :func:`~pickplace.policies.restore.load_policy`, as for errors.
@@ -119,22 +119,22 @@ def _load(checkpoint, trust: Sequence[str], **sizes) -> TrainedPolicy:
 
 
 def _observations(trained: TrainedPolicy, keys: Sequence[str], steps: int) -> list[Tensor]:
-    """Return entries of what the policy sees in its first steps in some episodes, ``[N, ...]`` each."""
+    """Return entries of the observations in the first steps of some episodes, ``[N, ...]`` each."""
     env = trained.make_env(num_envs=ENVS, stream="validation")
     seen = env.rollout(steps, trained, break_when_any_done=False).reshape(-1)
     return [seen[key].contiguous() for key in keys]
 
 
 def _some_problems(entries: list[Tensor], count: int) -> list[Tensor]:
-    """Return evenly spaced problems, one at least and all at most, with the last one, whose tote is mostly full."""
+    """Return evenly spaced problems, at least one and at most all; among them the last, usually with a full tote."""
     most = len(entries[0])
     rows = torch.linspace(-1, most - 1, max(1, min(count, most)) + 1)[1:].long()
     return [entry[rows] for entry in entries]
 
 
 def shapes_of(policy: ScoresAnySize) -> dict[str, tuple]:
-    """Return the sizes of entries that the model takes as they come; those of terms of your own follow from what is
-    done with them."""
+    """Return the shapes of the model's inputs, in which a :class:`Dim` may have any size. The export infers those of
+    a user's own terms."""
     tote = Dim("W_T", min=policy.least_tote), Dim("D_T", min=policy.least_tote)
     bins = (Dim("W_B"), Dim("D_B")) if policy.any_bin else (Dim.STATIC, Dim.STATIC)
     return {
@@ -149,12 +149,12 @@ def _convert(scores: Scores, keys: Sequence[str], seen: list[Tensor], known: dic
         dict(enumerate(known.get(key, (N, *[Dim.AUTO] * (entry.dim() - 1)))))
         for key, entry in zip(keys, seen, strict=True)
     )
-    with torch.no_grad():  # makes the tables that the rules keep: those that a trace makes would spoil later decisions
+    with torch.no_grad():  # fills the tables that the rules keep: tables from a trace would spoil later decisions
         scores(*(entry[:1] for entry in seen))
     logger = logging.getLogger("torch.onnx")
     before = logger.level
     try:
-        logger.setLevel(logging.ERROR)  # it tells of operators of packages that are not used
+        logger.setLevel(logging.ERROR)  # it reports operators of packages that are not used
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return torch.onnx.export(

@@ -33,13 +33,13 @@ SIZES = ("gripper", "bin_size", "tote_size")
 
 
 def restore_policy(cfg: DictConfig, cell: CellSpec, state: dict, trained_env: dict) -> Policy:
-    """Return the policy of a checkpoint for a cell, whose sizes need not be those of the training.
+    """Return the policy of a checkpoint for a cell, whose sizes may differ from those in training.
 
     Args:
         cfg: the checkpoint's config, with any overrides on top.
         cell: the sizes.
         state: the policy's tensors, ``state["policy"]`` of :func:`pickplace.runs.checkpoint.read`.
-        trained_env: the group ``env`` in training; its ``rotations`` must not be exceeded.
+        trained_env: the group ``env`` in training; the cell may not have more ``rotations``.
 
     Raises:
         ValueError: for more rotations than were trained, or tensors that do not fit the config or the sizes.
@@ -57,7 +57,7 @@ def restore_policy(cfg: DictConfig, cell: CellSpec, state: dict, trained_env: di
     try:
         return restored(cell)
     except checkpoint.CheckpointError as error:
-        trained = build_cell(trained_env, reach=None)  # a table of reach may be elsewhere
+        trained = build_cell(trained_env, reach=None)  # the file of a reach table may be missing here
         ours, theirs = (cell_settings(one, SIZES) for one in (cell, trained))
         different = [*differences(ours, theirs, "env")]
         if not different:
@@ -83,7 +83,7 @@ class TrainedPolicy(TensorDictModuleBase):
         config: of the training.
 
     Attributes:
-        cell: the sizes that it decides for.
+        cell: the sizes for which it decides.
     """
 
     def __init__(self, policy: Policy, terms: Mapping[str, Term], config: DictConfig):
@@ -127,18 +127,18 @@ def build_cell(env: dict, **given) -> CellSpec:
     """Return the cell of a config's group ``env``.
 
     Args:
-        env: the settings, resolved; those of no cell are ignored.
-        **given: settings of the cell that replace them, made already.
+        env: the settings, resolved; those that a cell does not have are ignored.
+        **given: settings of the cell that replace them, as objects.
 
     Raises:
-        ValueError: as of :func:`~pickplace.config.registry.build` and of the cell.
+        ValueError: see :func:`~pickplace.config.registry.build` and :class:`~pickplace.rules.cell.CellSpec`.
     """
     own = {key: env[key] for key in CELL_SETTINGS if key in env and key not in given}
     return cell_from_settings({**build("env", own), **given})
 
 
 def cell_settings(cell: CellSpec, keys: Collection[str] = CELL_SETTINGS) -> dict[str, Any]:
-    """Return settings of a cell as a config's group ``env`` has them."""
+    """Return settings of a cell in the form of a config's group ``env``."""
     return {key: node_of(f"env.{key}", getattr(cell, key)) for key in keys}
 
 
@@ -174,7 +174,7 @@ def load_policy(path, device: str = "cpu", trust: Sequence[str] = (), **sizes) -
     cfg = trusted_config(facts["config"], trust)
     env = cast(dict, OmegaConf.to_container(cfg.env, resolve=True))
     cell = build_cell(env, **sizes)
-    if not (cell.has_known_offsets or cfg.model.mask_infeasible):  # the policy chooses among grasps: so many are there
+    if not (cell.has_known_offsets or cfg.model.mask_infeasible):  # it gives the number of grasps to choose among
         cell = replace(cell, longest_side=longest_side(cell, build("items", cfg["items"])))
     policy = restore_policy(cfg, cell, state["policy"], env).to(usable_device(device))
     given = env.get("observation") or {}
@@ -184,7 +184,7 @@ def load_policy(path, device: str = "cpu", trust: Sequence[str] = (), **sizes) -
 
 
 def load_critic(path, trained: TrainedPolicy) -> "RestoredCritic | None":
-    """Return the critic of the checkpoint of a policy that :func:`load_policy` returned; None if it does not serve."""
+    """Return the critic from the checkpoint of a loaded policy, see :func:`load_policy`; None if it does not serve."""
     env = cast(dict, OmegaConf.to_container(trained.config.env, resolve=True))
     return restore_critic(trained.config, trained.policy, checkpoint.read(locate(path))[0], env)
 
@@ -211,12 +211,12 @@ def restore_critic(cfg: DictConfig, policy: Policy, state: dict, trained_env: di
 
     Args:
         cfg: the checkpoint's config.
-        policy: of the checkpoint; has the sizes.
+        policy: the policy of the checkpoint, which has the sizes.
         state: as :func:`pickplace.runs.checkpoint.read` returns it, with or without ``state["critic"]``.
         trained_env: the group ``env`` in training.
 
     Returns:
-        None where there is no critic, or it does not serve this tote.
+        The critic; None if there is none, or it does not serve this tote.
     """
     if isinstance(policy, EstimatesValue):
         critic = as_critic(policy.value_network())

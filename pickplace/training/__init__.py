@@ -1,1 +1,1 @@
-"""Training by PPO under a curriculum of tote heights."""
+"""Training of a policy under a curriculum."""

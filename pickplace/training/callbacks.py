@@ -27,7 +27,7 @@ class Callback:
         """Called when the curriculum has moved from one level to another, with their numbers."""
 
     def state_dict(self) -> dict:
-        """Return what a checkpoint stores for a resume, as JSON: numbers, texts, lists and dicts."""
+        """Return the state that a checkpoint stores for a resume, as JSON: numbers, texts, lists and dicts."""
         return {}
 
     def load_state_dict(self, state: dict) -> None:
@@ -37,8 +37,8 @@ class Callback:
 class EarlyStopping(Callback):
     """End the training at a validation occupancy, or when validations no longer improve.
 
-    The reason says if the end may be luck. That is so if the 95% interval of the validation that reached the occupancy
-    begins below it, or if all validations since the best one are below the interval of the best one.
+    The logged reason says if the end may be luck. It may be if the validation that reached the occupancy has a 95%
+    interval that begins below it, or if all validations since the best one are below the interval of the best one.
 
     Args:
         occupancy: mean validation occupancy, 0 to 1, that ends it; None: any.
@@ -84,7 +84,7 @@ def make_callbacks(cfg, states) -> dict[str, Callback]:
 
     Args:
         cfg: the config group ``callbacks``.
-        states: the state of each by name, from a checkpoint; one that has none begins anew.
+        states: their states by name, from a checkpoint; a callback without one begins anew.
 
     Raises:
         ValueError: naming the callback, for bad settings, a state that does not fit or one that cannot be saved.

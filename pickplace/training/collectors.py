@@ -48,7 +48,7 @@ class ResumableCollector(Collector):
         self.reset()
 
     def _setup_compact_obs(self, compact_obs: bool) -> None:
-        """Store each mask only where it was acted on, not again under ``next``, but for :attr:`next_keys`."""
+        """Store each mask only in the frame that used it, not again under ``next``, except :attr:`next_keys`."""
         super()._setup_compact_obs(compact_obs)
         if not compact_obs:
             masks = {key for key in self.env.observation_spec.keys() if key.endswith("_mask")}  # noqa: SIM118
@@ -150,8 +150,8 @@ def ignore_signals() -> None:
 def watch_workers(collector):
     """Raise an error in the main thread as soon as a worker process dies, whatever the main thread waits for.
 
-    TorchRL 0.14.1 checks its workers only between waits. It ends them by a signal that ours ignore, then closes them;
-    only an open worker that has ended is an error.
+    TorchRL 0.14.1 checks its workers only between waits. It ends them by a signal that our workers ignore,
+    then closes them. So a worker that has ended is an error only if it is not closed.
 
     Raises:
         WorkerDied: naming the worker and its exit code; the other workers are killed.
@@ -224,7 +224,7 @@ def multi_sync(
 ) -> MultiSyncCollector:
     """Make a collector of worker processes, each with its share of the slots (config ``collector=multi_sync``).
 
-    Args: as :func:`single`, and ``workers``, the number of processes; it must divide ``num_envs``.
+    Args: as in :func:`single`, and ``workers``, the number of processes; it must divide ``num_envs``.
     """
     collector = MultiSyncCollector(
         _shares(make_env, num_envs, workers, 64),
@@ -253,8 +253,8 @@ def ray(
 ) -> ResumableRayCollector:
     """Make a collector of worker processes in a Ray cluster (config ``collector=ray``, extra ``pickplace[ray]``).
 
-    Args: as :func:`multi_sync`, and ``address``: ``local`` starts a new Ray on this machine, ``auto`` or ``host:port``
-        joins a cluster.
+    Args: as in :func:`multi_sync`, and ``address``: ``local`` starts a new Ray on this machine, ``auto`` or
+        ``host:port`` joins a cluster.
 
     Raises:
         ValueError: without the extra, with a policy on a GPU, or if the workers do not divide the slots.

@@ -1,4 +1,4 @@
-"""What a training shows while it runs: a bar on a terminal, lines elsewhere and in the log file."""
+"""Progress of a training: a bar on a terminal, lines elsewhere and in the log file."""
 
 import logging
 import os
@@ -14,7 +14,7 @@ log = logging.getLogger(__name__)  # of the lines
 results = logging.getLogger("pickplace.results")  # of the lines that quiet=true shows, too
 
 LEAST_LINES = 20  # of a whole run
-LONGEST = 1e10  # greatest time to go that is shown; s
+LONGEST = 1e10  # greatest remaining time that is shown; s
 REFRESH = 0.1  # least time between two pictures of the bar; s
 
 #: The parts of a line, in their order. On a narrow terminal the bar leaves out the last ones of ``FIRST``.
@@ -31,7 +31,7 @@ class Progress:
     Args:
         frames: frames trained before.
         total: frames to train in all.
-        interval: frames between lines, if these are not more than a twentieth of all.
+        interval: frames between lines; at most a twentieth of ``total`` is used.
         bar: see :func:`terminal_bar`; or None.
     """
 
@@ -116,7 +116,7 @@ def terminal_bar() -> Iterator[Any]:
 
 @contextmanager
 def filtered_consoles(is_shown: Callable[[logging.LogRecord], bool]) -> Iterator[list[logging.StreamHandler]]:
-    """Show only some records of the log on the console in this block; files of the log have all.
+    """Show only some records of the log on the console in this block; log files get all.
 
     Returns:
         The handlers of the console, as the value of the ``with`` statement.

@@ -32,8 +32,8 @@ def write_report(
         episodes: the last validation, an :class:`pickplace.evaluation.play.Episodes` with recordings.
         cell: the sizes.
         facts: versions and commit.
-        curriculum: the curriculum, for what its levels are.
-        ended: why a callback has ended the training, if one has.
+        curriculum: the curriculum, for the names of its levels.
+        ended: reason why a callback has ended the training; empty: none has.
 
     Raises:
         OSError: naming the report, if it cannot be written.
@@ -106,8 +106,8 @@ def level_table(rows: list[dict], level_name: str, settings: Sequence[Mapping] =
 
     Args:
         rows: of ``metrics.csv``.
-        level_name: what a level is.
-        settings: what each of them sets, from number 1 on, if the config lists it.
+        level_name: name of a level.
+        settings: settings of each level, from number 1 on, if the config lists them.
     """
     lines: list[tuple] = []
     words = [str(level)[1:-1].replace("'", "") or "the full task" for level in map(dict, settings)]

@@ -65,7 +65,7 @@ def check_settings(cfg: DictConfig) -> None:
 def check_memory(cfg: DictConfig, env: PickPlaceEnv, policy: Policy, algorithm: Algorithm) -> None:
     """Refuse batches that would fill the memory.
 
-    A frame holds two observations, masks once, and what the critic computes for it, measured with ``pooled``.
+    A frame holds two observations, its masks once, and results of the critic, measured with ``pooled``.
 
     Args:
         cfg: the config.

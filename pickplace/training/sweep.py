@@ -1,7 +1,7 @@
 """The tables and the figure of a sweep, for any sweeper and launcher.
 
-``sweep.csv`` has a row for each run, ``sweep_settings.csv`` a row for each setting, over its seeds, and ``sweep.png``,
-with PDF and SVG beside it, the validation curves of each setting: their mean, and each seed.
+``sweep.csv`` has a row for each run. ``sweep_settings.csv`` has a row for each setting, over its seeds. ``sweep.png``,
+with PDF and SVG beside it, shows the validation curves of each setting: their mean, and each seed.
 
 ``python -m pickplace.training.sweep outputs/sweep/...`` writes them again, for example after a run was resumed.
 """
@@ -27,7 +27,7 @@ from pickplace.views.figures import figure_of, save
 log = logging.getLogger(__name__)
 
 TABLE, SETTINGS_TABLE, FIGURE = "sweep.csv", "sweep_settings.csv", "sweep.png"
-LARGEST_LEGEND = 40  # settings that the figure and the console name; of more, the best
+LARGEST_LEGEND = 40  # greatest number of settings that figure and console name, best first
 COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c8c8c"]  # Okabe and Ito's, no yellow
 
 
@@ -97,7 +97,7 @@ class Setting:
         overrides: without the seed.
         finished: the runs that finished, with a validation.
         mean: their mean final validation occupancy; None without any.
-        interquartile_mean: the mean of their middle half; None with fewer than four, of which it would be the mean.
+        interquartile_mean: the mean of their middle half; None with fewer than four, for which it would be the mean.
         interval: the 95% interval of their mean, see :func:`bootstrap95`; two times None with fewer than two.
         frames: the least and the greatest number of frames that they trained; two times None without any.
     """
@@ -117,7 +117,7 @@ class Setting:
 
     @property
     def curves(self) -> tuple[np.ndarray, np.ndarray]:
-        """Frames ``[V]`` and validation occupancies ``[V, S]`` of the finished runs; after an end, the last."""
+        """Frames ``[V]`` and validation occupancies ``[V, S]`` of the finished runs; an ended run keeps its last."""
         curves = [run.curve[:2] for run in self.finished]
         first = max((frames[0] for frames, _ in curves), default=0)  # from here on each run has a validation
         frames = np.unique([each for frames, _ in curves for each in frames if each >= first])
@@ -205,7 +205,7 @@ def _write_table(path: Path, columns: list[str], rows: list[list]) -> None:
 
 
 def label(setting: Setting, settings: list[Setting]) -> str:
-    """Label of a setting: the overrides in which the settings differ, and its runs that did not use their budget."""
+    """Label of a setting: the overrides in which settings differ, and its runs that did not use their budget."""
     words = [
         f"{key}={value}"
         for key, value in setting.overrides.items()

@@ -1,4 +1,4 @@
-"""The training loop, of a new run and of one that is resumed."""
+"""The training loop of new and of resumed runs."""
 
 import logging
 import sys
@@ -31,7 +31,7 @@ def train(cfg: DictConfig, run_dir: Path) -> float:
 
     Raises:
         ValueError: for settings that make no sense, or a run folder that holds another training.
-        KeyboardInterrupt: as :func:`run`.
+        KeyboardInterrupt: see :func:`run`.
     """
     expect(cfg.resume is None, "resume", cfg.resume, "as resume=<run folder> on the command line, without a +")
     with folder.claim(run_dir):
@@ -42,7 +42,7 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
     """Train from the beginning or from a checkpoint.
 
     Args:
-        cfg, run_dir: as of :func:`train`.
+        cfg, run_dir: as in :func:`train`.
         resume: state, facts and folder of the checkpoint to continue from.
 
     Returns:
@@ -99,8 +99,8 @@ def resume_run(overrides: list[str]) -> float:
         As :func:`train`.
 
     Raises:
-        ValueError: for a folder that is no run, or a change that a resumed run cannot follow; for one in which nothing
-            can be written it names the checkpoint that is whole.
+        ValueError: for a folder that is no run, or a change that a resumed run does not support. If nothing can be
+            written into the folder, it names the checkpoint that is intact.
     """
     place, words = resumed_place(overrides)
     saved = locate(place, prefer="last")

@@ -1,4 +1,4 @@
-"""The parts of a training run, its counters, and what a checkpoint stores of them."""
+"""The parts of a training run, its counters, and their state in a checkpoint."""
 
 import logging
 import shlex
@@ -46,7 +46,7 @@ log = logging.getLogger(__name__)
 #: Number of validations of a run whose interval is null.
 VALIDATIONS = 20
 
-#: Frames and batches trained, best validation occupancy, and the latest validation, in a new run.
+#: Counters of a new run: frames and batches trained, best validation occupancy, and the latest validation.
 NEW: dict[str, Any] = {"frames": 0, "iteration": 0, "best": -1.0, "latest": {}}
 
 
@@ -64,7 +64,7 @@ class Trainer:
         best: best validation occupancy so far; -1 before the first validation.
         latest: metrics of the latest validation.
         episodes: episodes of the latest validation of this process, or None.
-        ended: why a callback has ended the training; empty: none has.
+        ended: reason why a callback has ended the training; empty: none has.
         safe_folder: the checkpoint that was read or written last, or None.
 
     Raises:
@@ -149,7 +149,7 @@ class Trainer:
         settings.check_memory(cfg, self.env, self.policy, self.algorithm)
 
     def _restored(self, key: str, make, weights: dict) -> Any:
-        """Make a module, with the weights of the checkpoint that the run continues or begins with."""
+        """Make a module, with the weights of the checkpoint from which the run continues or begins."""
         refuse_large_network(make, f"model.{'actor' if key == 'policy' else key}")
         what = key if self.resumed else f"{key} in warm_start.weights={self.cfg.warm_start.weights}"
         try:
@@ -276,7 +276,7 @@ class Trainer:
         )
 
     def finish_batch(self, metrics: dict, before: int) -> None:
-        """Validate, log, save and print progress where their intervals ended between ``before`` and now."""
+        """Validate, log, save and print progress if their intervals ended between ``before`` and now."""
         cfg, frames = self.cfg, self.frames
         callbacks.call(self.callbacks, "on_batch", self, metrics)
         interval = cfg.evaluation_interval or -(-cfg.total_frames // VALIDATIONS)
@@ -287,7 +287,7 @@ class Trainer:
             log.info("%s frames: validation occupancy %.4f", f"{frames:,}", self.latest["occupancy"])
             callbacks.call(self.callbacks, "on_validation", self, self.episodes, metrics)
         self.logger.log(metrics, frames)
-        # After the row was logged, which a run resumed from this checkpoint needs.
+        # After the row was logged: a run that is resumed from this checkpoint needs it.
         if "eval/occupancy" in metrics and self.latest["occupancy"] > self.best:
             self.best = self.latest["occupancy"]
             self.save("best")
@@ -344,7 +344,7 @@ class Trainer:
             return
         levels = self.curriculum.what, end
         learning_curve(run_dir / "metrics.csv", run_dir / "learning_curve.png", levels, self.ended)
-        # Without an episode of this process nothing was trained since the report was written.
+        # If this process has no episodes, nothing was trained since the report was written.
         if self.is_complete and (self.episodes is not None or not (run_dir / folder.REPORT).is_file()):
             log.info("writing the report")
             occupancy = (self.episodes or self.validate()).occupancy
@@ -366,7 +366,7 @@ def episode_metrics(batch: TensorDictBase) -> dict[str, float]:
     if done.any():
         metrics["train/occupancy"] = batch["next", "occupancy"][done].mean().item()
         reasons = batch["next", "failure"][done]
-        # Without such an entry no rotation is forbidden, and no load is too much.
+        # Without these entries no rotation is forbidden, and no item is overloaded.
         entries = {Failure.FORBIDDEN_TURN: ("rotations", "handling"), Failure.OVERLOADED: ("handling",)}
         possible = [each for each in Failure if each not in entries or any(key in batch for key in entries[each])]
         metrics |= {f"train/failure_{each.name.lower()}": (reasons == each).float().mean().item() for each in possible}

@@ -13,27 +13,27 @@ from pickplace.policies.dtypes import matrix_dtype
 
 
 class CellsValue(ToteValue):
-    """Estimates which share of the empty volume above each cell of a tote will be filled.
+    """Estimates the share of the empty volume above each cell of a tote that will be filled.
 
-    It is fully convolutional: one set of weights serves any tote. A cell outside the tote looks like one that is full,
-    as neither an item nor the end effector can go lower there. Planes tell how deep a cell is, where the surface is not
-    level with the cell before, along x and along y, and which cells bear no weight. A convolution follows, then others
-    with stride 2, then residual ones. These also see the items that wait, and the mean over the tote, because whether
-    items still have places elsewhere decides how long the packing goes on. The last layer has an output for each cell
-    that the strides joined.
+    It is fully convolutional: one set of weights serves any tote. A cell outside the tote looks full, because neither
+    an item nor the end effector can go lower there. Planes of the input mark the depth of each cell, the edges along x
+    and along y, where the height differs from the cell before, and the cells that bear no weight. A convolution
+    follows, then convolutions with stride 2, then residual ones. The residual ones also see the items that wait, and
+    the mean over the tote: packing goes on for as long as items have places elsewhere. The last layer has an output for
+    each cell that the strides joined.
 
-    Every cell is a part of the value, and learns from the volume that is placed on it. That tells more than a sum, as
-    in Go, where a network learns faster if it also predicts who will own each point (Wu, Accelerating Self-Play
-    Learning in Go, 2019).
+    The estimate of each cell is a part of the value, and learns from the volume placed on that cell. The parts teach
+    more than their sum. In Go, too, a network learns faster if it also predicts the owner of each point (Wu,
+    Accelerating Self-Play Learning in Go, 2019).
 
     Args:
-        depth_range: levels of the depth that are told apart; deeper cells look alike.
+        depth_range: number of levels of depth; deeper cells look alike.
         level: height units of a level.
-        patch: cells along x, and along y, that the first convolution makes one.
+        patch: side of the squares of cells that the first convolution joins into one.
         stem: width of the first convolution.
         filters: width of the others.
-        halvings: convolutions with stride 2; with 0 the residual ones are as wide as the first.
-        layers: residual convolutions.
+        halvings: number of convolutions with stride 2; with 0 the residual ones are as wide as the first.
+        layers: number of residual convolutions.
         **settings: of :class:`~pickplace.policies.afterstate.value.ToteValue`.
     """
 
@@ -58,7 +58,7 @@ class CellsValue(ToteValue):
         whole_number("model.actor.halvings", halvings, 0, 4)
         whole_number("model.actor.layers", layers, 0, 100)
         self.patch = whole_number("model.actor.patch", patch, most=10)
-        self.joined = patch * 2**halvings  # cells along x, and along y, that the strides make one
+        self.joined = patch * 2**halvings  # side of the squares of cells that the strides join into one
         self.around = nn.Conv2d(depth_range + 3, stem, patch + 2, patch)
         self.halves = nn.ModuleList(
             nn.Conv2d(filters if number else stem, filters, 3, 2, padding=1) for number in range(halvings)
@@ -99,14 +99,14 @@ class CellsValue(ToteValue):
         return 8 * wide * deep * (self.depth_range + self.around.out_channels + self.head.in_channels)
 
     def credit(self, before: Sequence[Tensor], after: Sequence[Tensor]) -> Tensor:
-        """An item has the same volume on each cell that it covers: those that rise."""
+        """Return equal shares for the cells that change: the item covers these, with the same volume on each."""
         covered = (before[0] != after[0]).float()
         return covered / covered.sum((1, 2), keepdim=True).clamp(min=1)
 
     @torch.no_grad()
     def _planes(self, depth: Tensor, bearing: Tensor, dtype: torch.dtype) -> Tensor:
-        """Return how much of each level is empty, which cells bear no weight, and where the surface is not level,
-        ``[N, planes, W_T, D_T]``, channels last."""
+        """Return planes ``[N, planes, W_T, D_T]``, channels last: the empty share of each level, the cells that bear no
+        weight, and the edges along x and along y."""
         below = torch.arange(self.depth_range, device=depth.device)
         around = F.pad(depth, (1, 0, 1, 0))
         uneven = around.diff(dim=1)[..., 1:] != 0, around.diff(dim=2)[:, 1:] != 0

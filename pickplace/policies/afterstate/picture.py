@@ -1,4 +1,4 @@
-"""The network behind ``model=afterstate``: a picture of the tote, whatever its size."""
+"""The network behind ``model=afterstate``: it sees totes of any size as pictures of one size."""
 
 from collections.abc import Sequence
 
@@ -15,16 +15,16 @@ MAX_GRID = 64  # cells of the network's picture of a tote along each axis
 
 
 class PictureValue(ToteValue):
-    """Estimates which share of a tote's empty volume will be filled, from the heights of its surface.
+    """Estimates the share of a tote's empty volume that will be filled, from the heights of its surface.
 
-    It sees every tote as a picture of ``grid`` cells, whatever its size: a cell of the picture has the greatest height
-    of the cells of the tote that it covers, and the heights are told apart in ``grid[2]`` steps of the tote's height.
-    So a tote of 30 cells with items of three times the size looks like one of 10. Two more planes mark where the
-    surface is not level with the cell before, along x and along y, as items rest on level cells. Two convolutions, the
-    second with stride 2, and two linear layers follow. The first of these also sees the items that wait.
+    It sees every tote as a picture of ``grid`` cells. A cell of the picture has the greatest height of the tote's cells
+    that it covers, rounded up to one of ``grid[2]`` steps of the tote's height. So a tote of 30 cells with items of
+    three times the size looks like one of 10. Items rest on level cells. Therefore two more planes mark edges along x
+    and along y, where the height differs from the cell before. Two convolutions, the second with stride 2, and two
+    linear layers follow. The first linear layer also sees the items that wait.
 
-    A cell looks in one of few ways. So a CPU finds the terms of the first convolution in a table and only adds them,
-    unless it needs gradients; the result is the same up to rounding.
+    A cell of the picture can look in few ways only. So, without gradients, a CPU finds the terms of the first
+    convolution in a table and only adds them. The result is the same up to rounding.
 
     Args:
         grid: cells of the picture along x and y, and steps of the height.
@@ -62,8 +62,8 @@ class PictureValue(ToteValue):
         self.register_buffer("looks", looks(steps), persistent=False)
 
     def some_parts(self, *entries: Tensor) -> Tensor:
-        """Return the value of totes ``[N, W_T, D_T]`` of heights ``[N, 1]`` while items ``[N, M, 5]`` wait, ``[N, 1]``;
-        there is one part."""
+        """Return the values, ``[N, 1]``, one part each, of totes ``[N, W_T, D_T]`` with heights ``[N, 1]`` and waiting
+        items ``[N, M, 5]``."""
         depth, height, items = entries
         picture, dtype = self._picture(depth, height[:, 0]), matrix_dtype(self.compute_dtype, depth.device.type)
         with torch.autocast(depth.device.type, dtype, enabled=dtype != torch.float32):
@@ -87,15 +87,14 @@ class PictureValue(ToteValue):
         return wide == deep and self.grid[0] == self.grid[1]
 
     def _scale(self, depth: Tensor, height: Tensor) -> Tensor:
-        """Return what makes sides of items those of the picture, float32 ``[N, 3]``."""
+        """Return the factors that convert sides of items into cells and steps of the picture, float32 ``[N, 3]``."""
         wide, deep, steps = self.grid
         sides = height.new_tensor([wide / depth.shape[1], deep / depth.shape[2]], dtype=torch.float32)
         return torch.cat([sides.expand(len(height), 2), steps / height], 1)
 
     @torch.no_grad()
     def _picture(self, depth: Tensor, height: Tensor) -> Tensor:
-        """Return how each cell of the picture looks, int32 ``[N, *grid[:2]]``: a row of :func:`looks`; walls are
-        edges."""
+        """Return pictures, int32 ``[N, *grid[:2]]``: for each cell the row of :func:`looks`. Walls are edges."""
         wide, deep, steps = self.grid
         if depth.shape[1:] != (wide, deep):
             depth = -F.adaptive_max_pool2d(-depth[:, None], (wide, deep))[:, 0]
@@ -111,12 +110,12 @@ class PictureValue(ToteValue):
         return F.embedding(picture, self.looks).to(dtype).permute(0, 3, 1, 2)
 
     def _around_by_table(self, picture: Tensor) -> Tensor:
-        """Return the first convolution, ``[N, filters, *grid[:2]]``, channels last: a sum over the cells around each,
-        whose terms are found in a table."""
+        """Return the output of the first convolution, ``[N, filters, *grid[:2]]``, channels last: for each cell the sum
+        of table entries of the cells around it."""
         weight, margin, (wide, deep, _) = self.around.weight, self.around.padding[0], self.grid
         side = weight.shape[-1]
         table = self.looks @ weight.permute(2, 3, 1, 0)  # [side, side, looks, filters]
-        table[margin, margin] += self.around.bias  # of the cell itself, which is never outside
+        table[margin, margin] += self.around.bias  # with the cell itself, which is never outside
         begins = torch.arange(side**2, dtype=torch.int32) * len(self.looks)
         padded = F.pad(picture, [margin] * 4)
         around = [padded[:, x : x + wide, y : y + deep] for x in range(side) for y in range(side)]
@@ -126,10 +125,10 @@ class PictureValue(ToteValue):
 
 
 def looks(steps: int) -> Tensor:
-    """Return how cells of a picture can look, float32 ``[1 + 4 * (steps + 1), steps + 3]``.
+    """Return the planes of all cells that a picture can have, float32 ``[1 + 4 * (steps + 1), steps + 3]``.
 
-    Row 0 is outside the tote. Row ``1 + 4 * above + 2 * x + y`` is a cell that rises above so many steps of the height
-    and is an edge along x or along y, or is not. Columns: one for each step, a 1, and the edges along x and y.
+    Row 0 is a cell outside the tote. Row ``1 + 4 * above + 2 * x + y`` is a cell that is ``above`` steps high; x and y
+    are 1 if it is an edge along that axis. Columns: one for each step, a 1, and the edges along x and y.
     """
     above, along_x, along_y = torch.meshgrid(torch.arange(steps + 1), *2 * [torch.arange(2)], indexing="ij")
     columns = [*(above > step for step in range(steps)), torch.ones_like(above), along_x, along_y]

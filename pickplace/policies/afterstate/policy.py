@@ -19,13 +19,13 @@ from pickplace.rules.step import put_down
 
 
 class Afterstate(FootprintPolicy):
-    """``afterstate``: chooses, among the items and the footprints that occupy a corner, the greatest sum of the item's
-    volume and the value of the tote with it.
+    """``afterstate``: chooses the item and the footprint with the greatest sum of the item's volume and the value of
+    the tote after it. It considers footprints that occupy a corner.
 
-    The reward of an item is its volume wherever it lies, so that placements of one item differ only in the tote that
-    they leave, the *afterstate* (Sutton & Barto 2018, section 6.8). Its value is what ``algo=td`` learns; the logit is
-    the sum, scaled as rewards are, divided by a temperature. The value also depends on the items that wait, those that
-    are left in the bin and those that are seen to come, as one set.
+    The reward of an item is its volume, wherever it lies. So placements of one item differ only in the tote that they
+    leave, the *afterstate* (Sutton & Barto 2018, section 6.8). ``algo=td`` learns the values of afterstates. The logit
+    is the sum, scaled as rewards are, divided by a temperature. The value also depends on the set of items that wait:
+    those left in the bin and those in the preview.
 
     Args:
         cell: the sizes.
@@ -47,7 +47,7 @@ class Afterstate(FootprintPolicy):
         return self.network
 
     def learning_bytes(self, samples: int | None = None) -> int:
-        """Return about how many bytes a frame takes, measured at totes of 10 to 100 cells."""
+        """Return the approximate bytes of a frame, measured at totes of 10 to 100 cells."""
         return self.network.learning_bytes(*self.cell.tote_size[:2])
 
     def item_keys(self, cell: CellSpec) -> tuple[str, ...]:
@@ -64,15 +64,15 @@ class Afterstate(FootprintPolicy):
         return after, item.volume, value
 
     def scores(self, observation: Observation, row: Tensor, footprint: Tensor) -> Tensor:
-        state = State.from_observation(observation)._replace(pile=None)  # what lies on what is not in the picture
+        state = State.from_observation(observation)._replace(pile=None)  # the networks do not see piles
         before = state.rows(row)
         _, volume, value = self.judge(before, footprint)
-        less = before.items.volume.amax(1) - volume  # than of the largest item: exactly 0 with one in the bin
+        less = before.items.volume.amax(1) - volume  # relative to the largest item: exactly 0 with one in the bin
         return (value - self.network.reward_scale * less) / self.temperature
 
     def action_log_probs(self, observation: Observation) -> Tensor:
-        """Return the distribution over flat actions ``[N, N_a]``. Only those that succeed have a value: an item must be
-        put down to look at the tote after it."""
+        """Return the distribution over flat actions ``[N, N_a]``. Actions that fail leave no tote to judge: they have
+        probability 0."""
         state = State.from_observation(observation)
         maps = placing_maps(self.cell, state)
         log_probs = self.footprint_logits(observation, self.ranked(maps)).log_softmax(-1)
@@ -83,16 +83,16 @@ class Afterstate(FootprintPolicy):
 
 
 class AfterstateFcn(Afterstate):
-    """``afterstate_fcn``: the same by a fully convolutional network, which serves any tote.
+    """``afterstate_fcn``: :class:`Afterstate` with a fully convolutional network, which serves any tote.
 
     Args:
-        cell, mask_infeasible, temperature: as of :class:`Afterstate`.
+        cell, mask_infeasible, temperature: as in :class:`Afterstate`.
         **network: arguments of the network, :class:`~pickplace.policies.afterstate.cells.CellsValue`.
     """
 
     network_class = CellsValue
     score_index = FOOTPRINT_INDEX
-    any_bin = False  # the rules look at what is below the largest item that a bin of the cell holds
+    any_bin = False  # the rules look at squares of the largest item that the cell's bin can hold
 
     def __init__(self, cell: CellSpec, mask_infeasible: bool = True, **settings):
         super().__init__(cell, mask_infeasible, **settings)

@@ -1,4 +1,4 @@
-"""The base of networks that estimate what totes will still take, whatever arrives."""
+"""The base of networks that estimate the volume that totes will still take."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -16,8 +16,8 @@ class ToteValue(nn.Module, ABC):
     """Estimates the volume that a tote will still take. The value is a sum of parts, and each part is learnt.
 
     Args:
-        mirrored: whether totes are mirrored and transposed at random while it learns. The value is the same, unless
-            items, end effector or reach tell the sides of the tote apart.
+        mirrored: whether totes are mirrored and transposed at random in training. The true value stays the same, unless
+            items, end effector or reach treat the sides of the tote differently.
         all_views: whether a value is the mean over all these views of a tote, in evaluation mode (``eval()``). With
             eight views this takes eight times as long.
         reward_scale: the config's ``reward_scale``; values are volumes times this.
@@ -25,7 +25,7 @@ class ToteValue(nn.Module, ABC):
 
     Attributes:
         in_keys: entries of the observation that it reads, in order.
-        cells_at_once: cells whose activations a type of device holds at a time when gradients are off.
+        cells_at_once: by type of device, number of cells whose activations are held at a time without gradients.
     """
 
     in_keys: tuple[str, ...]
@@ -37,13 +37,13 @@ class ToteValue(nn.Module, ABC):
         super().__init__()
         self.mirrored = flag("model.actor.mirrored", mirrored)
         self.all_views = flag("model.actor.all_views", all_views)
-        self.reward_scale = number("model.actor.reward_scale", reward_scale, 1e-9, 1e38)  # as of the training
+        self.reward_scale = number("model.actor.reward_scale", reward_scale, 1e-9, 1e38)  # the training's
         self.compute_dtype = one_of("model.actor.compute_dtype", compute_dtype, DTYPES)
 
     def forward(self, *entries: Tensor) -> Tensor:
-        """Return the value of each tote, float32 ``[..., 1]``, of the entries :attr:`in_keys`, such as ``tote_depth``
-        ``[..., W_T, D_T]`` and ``tote_height`` ``[..., 1]``. ``items`` are those that wait: without the one that has
-        been placed, and before others arrive."""
+        """Return the value of each tote, float32 ``[..., 1]``, from the entries :attr:`in_keys`, such as ``tote_depth``
+        ``[..., W_T, D_T]`` and ``tote_height`` ``[..., 1]``. ``items`` are those that wait after a placement, before
+        others arrive."""
         batch, wide, deep = entries[0].shape[:-2], *entries[0].shape[-2:]
         flat = tuple(entry.flatten(0, len(batch) - 1) for entry in entries)
         if self.training or not (self.mirrored and self.all_views):
@@ -65,30 +65,30 @@ class ToteValue(nn.Module, ABC):
         return torch.cat([self.some_parts(*each) for each in some])
 
     def cells(self, wide: int, deep: int) -> int:
-        """Return how many cells the network looks at in a tote of ``wide x deep``."""
+        """Return the number of cells that the network looks at in a tote of ``wide x deep``."""
         return wide * deep
 
     @abstractmethod
     def some_parts(self, *entries: Tensor) -> Tensor:
-        """Return what :meth:`parts` does, for few totes."""
+        """Return :meth:`parts` for totes that are few enough to compute at once."""
 
     @abstractmethod
     def learning_bytes(self, wide: int, deep: int) -> int:
-        """Return about how many bytes a tote of ``wide x deep`` cells takes in a gradient step."""
+        """Return the approximate bytes of a tote of ``wide x deep`` cells in a gradient step."""
 
     @abstractmethod
     def credit(self, before: Sequence[Tensor], after: Sequence[Tensor]) -> Tensor:
-        """Return which share of the reward of a placement each part of the value earns, float32 ``[N, ...]``.
+        """Return the share of a placement's reward that each part of the value earns, float32 ``[N, ...]``.
 
         Args:
             before, after: the entries of totes before and after the placement, ``[N, ...]`` each.
         """
 
     def random_view(self, *maps: Tensor) -> tuple[Tensor, ...]:
-        """Return maps as seen from a side of the tote, drawn at random among those from which the value is the same.
+        """Return maps mirrored and transposed at random, as far as the value stays the same.
 
         Args:
-            maps: as of :func:`seen_from`.
+            maps: as in :func:`seen_from`.
         """
         if not self.mirrored:
             return maps
@@ -104,13 +104,14 @@ class ToteValue(nn.Module, ABC):
 def seen_from(entries: Sequence[Tensor], axes: list[int], turned: bool) -> tuple[Tensor, ...]:
     """Return the entries with all maps ``[N, W_T, D_T]`` flipped along axes, then transposed if ``turned``.
 
-    Of tables of items, int64 ``[N, M, 5]``, the axes are exchanged; entries of other dimensions come back as they are.
+    In tables of items, int64 ``[N, M, 5]``, ``turned`` exchanges x and y. Entries with another number of dimensions are
+    returned unchanged.
     """
     return tuple(_seen_from(entry, axes, turned) if entry.dim() == 3 else entry for entry in entries)
 
 
 def _seen_from(entry: Tensor, axes: list[int], turned: bool) -> Tensor:
     if not entry.is_floating_point():
-        return entry[..., [1, 0, 3, 2, 4]] if turned else entry  # the places of items in the bin tell nothing
+        return entry[..., [1, 0, 3, 2, 4]] if turned else entry  # positions in the bin do not matter
     flipped = entry.flip(axes)
     return flipped.transpose(1, 2) if turned else flipped

@@ -1,16 +1,16 @@
-"""What a value network sees of the items that wait."""
+"""Encoding of the items that wait, for value networks."""
 
 import torch
 from torch import Tensor, nn
 
-TYPICAL = 4.0  # a side in cells, so that the features are about one
+TYPICAL = 4.0  # side of an item in cells; divided by it, the features are near 1
 
 
 class WaitingItems(nn.Module):
-    """Encodes a set of items, in any number: a sum over them, as of Zaheer et al., Deep Sets (2017).
+    """Encodes a set of any number of items by a sum over them (Zaheer et al., Deep Sets, 2017).
 
-    The sum passes through a layer without a bias that starts at zero. So no item is no sum, and weights that know no
-    waiting items go on as they are.
+    The sum passes through a layer without a bias, whose weights start at zero. So an empty set has the code 0, and
+    weights that were trained without waiting items still serve.
 
     Args:
         width: of the encoding.
@@ -28,10 +28,10 @@ class WaitingItems(nn.Module):
 
         Args:
             items: int64 ``[N, M, 5]``: x, y, w, d and h; rows of zeros are no items.
-            scale: float32 ``[N, 3]`` or ``[3]``, by which w, d and h are multiplied, to be cells.
+            scale: float32 ``[N, 3]`` or ``[3]``, the factors that convert w, d and h into cells.
         """
         exists = items[..., 4:] > 0
         w, d, h = (items[..., 2:] * scale.unsqueeze(-2) / TYPICAL).unbind(-1)
-        # Small networks do not multiply: the volume, and the faces, decide how well an item fits.
+        # Volume and faces decide how well an item fits, and a small network cannot multiply.
         seen = torch.stack([w, d, h, w * d, w * h, d * h, w * d * h], -1)
         return self.sum((self.each(seen) * exists).sum(-2))

@@ -1,21 +1,22 @@
 """The paper's policy network: 4D convolutions over (pick x, pick y, place x, place y).
 
-How the 4D convolutions are computed, exactly and without a 4D kernel:
+The 4D convolutions are computed exactly, but without a 4D kernel:
 
 * **First layer.** Its two input channels are 2D maps broadcast to 4D: the bin's does not change along the
   place axes, the tote's not along the pick axes. So the layer is two 2D convolutions, whose kernels are the
   4D kernel summed over the other map's taps, and a broadcast sum.
-* **Second layer.** The sum, over the three taps of the pick x axis, of a 3D convolution over the other axes.
+* **Second layer.** A sum over the three taps of the pick x axis, each a 3D convolution over the other axes.
   With pick x outermost in memory, before the batch, each tap's input is a contiguous slice and nothing is
   copied.
   A CPU without units for bfloat16 acts three times as fast with :mod:`~pickplace.policies.fcn4d.winograd`.
 * **Head.** ``1x1x1x1`` is a matrix product over the channels.
-* **Single pairs** of a pick and a place. Only what their logits see is computed: matrix products with the whole kernel.
+* **Single pairs** of a pick and a place. Only the features that their logits see are computed, by matrix products with
+  the whole kernel.
 
 The parameters are those of the 4D convolutions, though only sums over taps of the first kernel matter. A
-kernel stored as these sums would compute the same, but start and learn differently: its initial scale would
-be another, and each of its entries stands for nine that receive the same gradient, so one step of an
-optimizer moves the sum nine times as far. Keeping the full kernel keeps the paper's training dynamics.
+kernel stored as these sums would compute the same, but start and learn differently. Its initial scale would
+differ. In the full kernel, each sum has nine entries that receive the same gradient, so one step of an
+optimizer moves it nine times as far. Keeping the full kernel keeps the paper's training dynamics.
 """
 
 import math
@@ -31,14 +32,14 @@ from pickplace.policies.fcn4d.winograd import SumConvolution, tile_count
 
 BIN_PADDING, TOTE_PADDING = -1.0, 0.0
 MAX_DEPTH = 10_000  # height units; deeper than any tote
-PAIRS_AT_ONCE = {"cpu": 128, "cuda": 65_536}  # whose hidden activations stay in a CPU's caches
-FEW_TILES = 4  # fewer are not worth a transformed kernel
+PAIRS_AT_ONCE = {"cpu": 128, "cuda": 65_536}  # pairs whose hidden activations stay in a CPU's caches
+FEW_TILES = 4  # for fewer it does not pay to transform the kernel
 TILE_BYTES = 8 * 2**20  # of the tiles computed at a time, which stay in the caches
-PADDED_PAIRS = 64  # their number is rounded up to a multiple; see PADDED_ROWS in fcn_grasp/network.py
+PADDED_PAIRS = 64  # the number of pairs is rounded up to a multiple; see PADDED_ROWS in fcn_grasp/network.py
 
 
 def check_clips(place: str, bin_clip: float | None, tote_clip: float | None, floor: float | None) -> None:
-    """Refuse limits of depth clipping that are no depths; ``place`` is where the config has them."""
+    """Refuse limits of depth clipping that are no depths; ``place`` is their place in the config."""
     number_or_null(f"{place}.bin_clip", bin_clip, 0, MAX_DEPTH)
     number_or_null(f"{place}.tote_clip", tote_clip, 0, MAX_DEPTH)
     number_or_null(f"{place}.floor", floor, -MAX_DEPTH, MAX_DEPTH)
@@ -52,7 +53,7 @@ def clip_and_pad(depth: Tensor, limit: float | None, floor: float | None, paddin
 class Conv4dParameters(nn.Module):
     """Weight ``[out, in, k, k, k, k]`` and bias ``[out]`` of a 4D convolution, drawn as `nn.Conv2d` does.
 
-    The kernel's axes are pick x, pick y, place x, place y. It only holds them: `Conv4dNet` computes.
+    The kernel's axes are pick x, pick y, place x, place y. It only holds them; `Conv4dNet` computes with them.
     """
 
     def __init__(self, in_channels: int, out_channels: int, kernel: int):
@@ -77,14 +78,14 @@ class Conv4dNet(nn.Module):
         filters: channels of the two hidden layers.
         bin_clip: ``H_0_max`` of eq. 4; None for no clipping.
         tote_clip: ``H_1_max`` of eq. 4; None for no clipping, the "4D FCN" that the paper compares with.
-        floor: clamps the clipped maps, both, from below; None, as in the paper, for no floor.
-        compute_dtype: of the hidden layers' activations, ``float32`` (the parameters' own type, strictly),
+        floor: least value of both clipped maps; None, as in the paper, for no floor.
+        compute_dtype: dtype of the hidden activations: ``float32`` (strictly, the dtype of the parameters),
             ``bfloat16``, or ``auto``: bfloat16 where the device has units for it, which are 3 to 5 times as fast.
             Parameters, head and logits stay float32.
-        head_std: standard deviation of the head's initial weights, its bias being 0, so that the policy
-            starts near uniform; None for PyTorch's default.
-        chunk_bytes: hidden activations held at a time when gradients are off: large batches are cut along the
-            batch, and single states too large for it along pick x. The result is the same up to rounding.
+        head_std: standard deviation of the head's initial weights; its bias is 0. If it is small, the policy
+            starts near uniform. None: PyTorch's default.
+        chunk_bytes: bytes of hidden activations held at a time without gradients. Large batches are cut along the
+            batch, and a single state that is too large along pick x. The result is the same up to rounding.
     """
 
     receptive_field = 5
@@ -123,8 +124,8 @@ class Conv4dNet(nn.Module):
         Args:
             bin_depth: height above the bin's floor, ``[..., W_B, D_B]``.
             tote_depth: remaining height, ``[..., W_T, D_T]``, same leading dimensions.
-            pick: flat pick cells ``x * D_B + y``, ``[...]``, when they are already chosen (the paper's
-                individual planning). Only their part is computed, some 10 to 20 times faster on a 5x5 bin.
+            pick: flat pick cells ``x * D_B + y``, ``[...]``, if they are already chosen (the paper's
+                individual planning). Then only their part is computed, 10 to 20 times faster on a 5x5 bin.
 
         Returns:
             ``[..., W_B * D_B * W_T * D_T * R]``, or ``[..., W_T * D_T * R]`` for given pick cells.
@@ -134,9 +135,9 @@ class Conv4dNet(nn.Module):
             pick, field, row = pick.flatten(), self.receptive_field, torch.arange(len(bins), device=bins.device)
             windows, deep = bins.unfold(1, field, 1).unfold(2, field, 1), bin_depth.shape[-1]
             bins = windows[row, pick // deep, pick % deep]
-        if torch.compiler.is_exporting():  # at once: the number of pieces depends on the sizes
+        if torch.compiler.is_exporting():  # in one piece: the number of pieces would depend on the sizes
             out = self._logits(bins, totes)
-        elif pick is None and self._by_tiles(bins, totes):  # one pick alone is faster at once
+        elif pick is None and self._by_tiles(bins, totes):  # a single pick is faster without tiles
             out = self._logits_by_tiles(bins, totes)
         else:
             out = self._logits_by_chunks(bins, totes)
@@ -193,7 +194,7 @@ class Conv4dNet(nn.Module):
         return torch.cat(parts)
 
     def _chunk_sizes(self, bins: Tensor, totes: Tensor) -> tuple[int, int]:
-        """Return how many states, and how many rows of pick cells of each, to compute at a time."""
+        """Return the number of states, and of rows of pick cells of each, to compute at a time."""
         states, rows = len(bins), bins.shape[1] - 4
         if torch.is_grad_enabled():
             return max(states, 1), rows
@@ -211,7 +212,7 @@ class Conv4dNet(nn.Module):
         if bins.shape[1:] == (5, 5):
             return self._convolve_one_pick(from_bin.permute(0, 2, 3, 1).contiguous(), from_tote)
         from_bin = from_bin.permute(2, 0, 3, 1).contiguous()  # [W_B + 2, N, D_B + 2, filters]
-        # One axis after the other: the gradient is then summed over one at a time, which is six times as fast as both.
+        # One axis after the other: the gradient is then summed over one axis at a time, which is six times as fast.
         from_tote = from_tote[:, None].expand(-1, from_bin.shape[2], -1, -1, -1)
         from_tote = from_tote[None].expand(from_bin.shape[0], -1, -1, -1, -1, -1)
         hidden = (from_bin[:, :, :, None, None] + from_tote).relu_()
@@ -227,10 +228,11 @@ class Conv4dNet(nn.Module):
         return out.relu_().permute(0, 2, 3, 4, 1).unflatten(0, (rows, bins.shape[0]))
 
     def _by_tiles(self, bins: Tensor, totes: Tensor) -> bool:
-        """Return whether minimal filtering is faster; with gradients it would hold more memory."""
+        """Return whether to use minimal filtering: where it is faster, and not with gradients, for which it holds more
+        memory."""
         if bins.device.type != "cpu" or torch.is_grad_enabled() or torch.is_autocast_enabled("cpu"):
             return False
-        is_exact = self._dtype in (torch.float32, torch.float64)  # in less the transforms lose too many digits
+        is_exact = self._dtype in (torch.float32, torch.float64)  # in lower precision the transforms lose many digits
         return is_exact and len(bins) * tile_count(*_sizes(bins, totes)) >= FEW_TILES
 
     def _logits_by_tiles(self, bins: Tensor, totes: Tensor) -> Tensor:
@@ -281,7 +283,7 @@ def _sizes(*maps: Tensor) -> list[tuple[int, int]]:
 
 
 def _patches(maps: Tensor, row: Tensor, cell: Tensor) -> Tensor:
-    """Return which outputs of the first layer, ``[N, W + 2, D + 2]`` flat, are under the 3x3 taps around cells.
+    """Return the flat indices of outputs of the first layer, ``[N, W + 2, D + 2]``, under the 3x3 taps around cells.
 
     Args:
         maps: ``[N, W, D]``, for its sizes.

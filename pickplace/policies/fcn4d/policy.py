@@ -25,7 +25,7 @@ class Conv4dPolicy(ActionPolicy):
 
     def __init__(self, cell: CellSpec, mask_infeasible: bool = False, **network):
         super().__init__(cell, mask_infeasible)
-        self.network = Conv4dNet(4, **network)  # of which the first R count: the weights serve fewer rotations too
+        self.network = Conv4dNet(4, **network)  # only the first R are used: the weights serve fewer rotations too
 
     def action_scores(self, observation: Observation, mask: Tensor | None = None) -> Tensor:
         maps, rotations = (observation["bin_depth"], observation["tote_depth"]), self.cell.rotations
@@ -51,7 +51,7 @@ class Conv4dPolicy(ActionPolicy):
         return logits.gather(1, rotation[:, None]).view(choices.shape)
 
     def learning_bytes(self, samples: int | None = None) -> int:
-        """Return about how many bytes a frame takes, measured at bins and totes of 5x5 to 12x12."""
+        """Return the approximate bytes of a frame, measured at bins and totes of 5x5 to 12x12."""
         if samples is not None:
             return (1 + samples) * 400 * self.network.filters
         sides = (*self.cell.bin_size[:2], *self.cell.tote_size[:2])
@@ -65,7 +65,7 @@ class Conv4dPolicy(ActionPolicy):
         """Check the paper's conditions on sizes.
 
         Raises:
-            ValueError: where one is not met: this policy cannot learn then.
+            ValueError: if one is not met, because then this policy cannot learn.
         """
         if found := super().check_sizes():
             raise ValueError(" ".join(found))
@@ -73,7 +73,7 @@ class Conv4dPolicy(ActionPolicy):
 
 
 class Fcn4d(Conv4dPolicy):
-    """The paper's policy (config ``model=fcn4d``; Sec. III); arguments as of :class:`Conv4dPolicy`."""
+    """The paper's policy (config ``model=fcn4d``; Sec. III); arguments as in :class:`Conv4dPolicy`."""
 
     score_index = "(((x_B * D_B + y_B) * W_T + x_T) * D_T + y_T) * R + r: pick cell, place cell, quarter turns"
     unmasked_scores = Conv4dPolicy.action_scores
@@ -82,13 +82,13 @@ class Fcn4d(Conv4dPolicy):
 class Typical(Conv4dPolicy):
     """``fcn4d`` with one fully connected layer over all logits (config ``model=typical``; Sec. IV of the paper).
 
-    The layer is a square of side ``N_a``, so that it is tied to the sizes that it is trained at, and its memory grows
-    with the fourth power of the tote's side: 50 MB at ``6x6``, 400 MB at ``10x10``, 32 GB at ``30x30`` with ``R=4``.
+    The layer has ``N_a x N_a`` weights. So it is tied to the sizes in training, and its memory grows with the fourth
+    power of the tote's side: 50 MB at ``6x6``, 400 MB at ``10x10``, 32 GB at ``30x30`` with ``R=4``.
 
-    Args: as :class:`Conv4dPolicy`.
+    Args: as in :class:`Conv4dPolicy`.
 
     Raises:
-        ValueError: for a layer that memory does not hold.
+        ValueError: if the layer does not fit into the memory.
     """
 
     def __init__(self, cell: CellSpec, mask_infeasible: bool = False, **network):
@@ -106,7 +106,7 @@ class Typical(Conv4dPolicy):
         logits = self.join(super().action_scores(observation))
         return logits if mask is None else torch.where(mask, logits, MASKED)
 
-    # The last layer joins all logits.
+    # The last layer needs all logits.
     choice_logits = ActionPolicy.choice_logits
 
     def learning_bytes(self, samples: int | None = None) -> int:

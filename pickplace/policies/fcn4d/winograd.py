@@ -1,13 +1,13 @@
 """The second 4D convolution by minimal filtering, with a tenth of the multiplications.
 
 Minimal filtering (Winograd, Arithmetic Complexity of Computations, 1980; Lavin and Gray, Fast Algorithms for
-Convolutional Neural Networks, 2016) computes ``m`` outputs of a kernel with three taps by ``m + 2`` multiplications in
-place of ``3 m``: inputs and kernel are multiplied with small constant matrices, then with each other, and the products
-with a third constant matrix. A long axis is cut into tiles of at most 6 outputs.
+Convolutional Neural Networks, 2016) computes ``m`` outputs of a kernel with three taps by ``m + 2`` multiplications
+instead of ``3 m``. Inputs and kernel are multiplied with small constant matrices, then with each other. The products
+are multiplied with a third constant matrix. A long axis is cut into tiles of at most 6 outputs.
 
-Three of the four axes are done so: both of the place, and pick y. Over pick x the three taps are summed, because the
-transformed kernel has to fit into the caches. The result is that of the convolution up to rounding: in float32 the
-error is about 5e-6 of the greatest logit.
+Three of the four axes are computed like this: both of the place, and pick y. Over pick x the three taps are summed,
+because the transformed kernel has to fit into the caches. The result is that of the convolution up to rounding: in
+float32 the error is about 5e-6 of the greatest logit.
 """
 
 import functools
@@ -59,7 +59,7 @@ class Tiles:
 
 
 def tile_count(bin_size: tuple[int, int], tote_size: tuple[int, int]) -> int:
-    """Return into how many tiles a state is cut."""
+    """Return the number of tiles into which a state is cut."""
     return math.prod(Tiles(length).count for length in (bin_size[1], *tote_size))
 
 
@@ -93,7 +93,7 @@ class SumConvolution:
         return bins.flatten(0, 2), totes.expand(-1, pick.count, -1, -1, -1, -1).flatten(0, 2)
 
     def tile_values(self) -> int:
-        """Return how many numbers of each channel a tile has before its multiplications."""
+        """Return the number of values of each channel that a tile has before its multiplications."""
         return len(self.pick_first) * len(self.place_first) * (self.width + 2)
 
     def __call__(self, from_bin: Tensor, from_tote: Tensor) -> Tensor:
@@ -111,7 +111,7 @@ class SumConvolution:
         return out.view(*out.shape[:2], self.width, from_tote.shape[1], -1)
 
     def join(self, tiles: Tensor) -> Tensor:
-        """Return ``[N, W_B, D_B, W_T, D_T, channels]`` of the outputs of all tiles, or of what follows from them."""
+        """Join the outputs of all tiles, or values computed from them, into ``[N, W_B, D_B, W_T, D_T, channels]``."""
         pick, x, y = self.axes
         tiles = tiles.view(pick.size, x.size, y.size, self.width, -1, pick.count, x.count, y.count, tiles.shape[-1])
         whole = tiles.permute(4, 3, 5, 0, 6, 1, 7, 2, 8).flatten(2, 3).flatten(3, 4).flatten(4, 5)

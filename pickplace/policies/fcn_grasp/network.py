@@ -1,4 +1,4 @@
-"""The fully convolutional network behind ``fcn_grasp``: the tote around a footprint, seen from what would lie there."""
+"""The fully convolutional network behind ``fcn_grasp``: it sees the tote around a footprint."""
 
 import torch
 import torch.nn.functional as F
@@ -16,35 +16,35 @@ MAX_LEVELS = 255  # levels are uint8
 OUTSIDE = -1000  # the depth of a cell that is not in the tote
 FAR_DOWN = 10_000  # deeper than any tote
 
-#: What the rows of a bf16 product are rounded up to, beyond how many: one is prepared and kept for each number of rows,
-#: which takes time and memory. Few rows are rounded up, too: a product of few adds up in another order, and near ties
-#: would be decided by the size of the batch.
+#: Pairs ``(beyond, step)``: more than ``beyond`` rows of a bf16 product are rounded up to a multiple of ``step``. A
+#: kernel is prepared and kept for each number of rows, which takes time and memory. Few rows are rounded up, too: their
+#: products add up in another order, so the size of the batch would decide near ties.
 PADDED_ROWS = ((4096, 512), (0, 64))
 
 
 class FootprintFcn(nn.Module):
-    """Scores footprints by what surrounds them, as heights relative to the item that would lie there.
+    """Scores footprints by the heights around them, relative to the item that would lie there.
 
-    A convolution of ``receptive_field x receptive_field`` and two of ``1x1``, one set of weights for any tote, computed
-    as matrix products over the patches around the footprints that are asked for. A patch is centred on its footprint
-    and turned with it, so that an item that is turned is seen as one that is not. Its cells are one-hot: around the
-    footprint, the height above the top that the item would have; under it, the depth of the hole that it would close;
-    nothing outside the tote. After the patch come the item's width, depth and height, the headroom above its top (too
-    little, none, or how much), and how far above the deepest place of the tote it rests (the clipped depth of
-    eq. 4), one-hot each. Cells that bear no weight are marked, too; and of several items in the bin the network sees
-    the mean of the others' codes. What these do is learned from zero, so that weights that were trained without them
-    serve.
+    The network is a convolution of ``receptive_field x receptive_field`` and two of ``1x1``, so one set of weights
+    serves any tote. It is computed as matrix products over the patches around the requested footprints. A patch is
+    centred on its footprint and turned with it, so a turned item looks like one that is not turned. Its cells are
+    one-hot. Around the footprint they encode the height above the top that the item would have; under it, the depth of
+    the hole that the item would close; outside the tote, nothing. After the patch come five one-hot codes: the item's
+    width, depth and height, the headroom above its top (too little, none, or how much), and its height above the
+    deepest place of the tote (the clipped depth of eq. 4). Cells that bear no weight are marked, too. With several
+    items in the bin the network also sees the mean of the others' codes. The weights of these two inputs start at zero,
+    so weights that were trained without them still serve.
 
     Args:
-        out_channels: scores of each footprint.
+        out_channels: number of scores of each footprint.
         filters: width of the convolution.
         receptive_field: side of the square that is seen, odd, at least 3; cells.
         hidden: width of the 1x1 layer before the output.
         tote_clip: ``H_1_max`` of eq. 4, in whole cells.
-        depth_range: number of clipped depths told apart.
-        headroom_bins: number of headrooms told apart: too little, none, 1, 2, ...; None: ``depth_range``. Few serve
-            totes that are higher than those in training.
-        reach: heights around a footprint are told apart up to so many cells above and below the item's top.
+        depth_range: number of clipped depths that have a code.
+        headroom_bins: number of headrooms that have a code: too little, none, 1, 2, ...; None: ``depth_range``. A small
+            number serves totes that are higher than those in training.
+        reach: heights around a footprint are limited to this many cells above and below the item's top.
         item_range: sides and heights from this one on look alike.
         head_std: standard deviation of the last layer's initial weights.
         compute_dtype: ``"float32"``, ``"bfloat16"`` (autocast of the matrix products), or ``"auto"``: bfloat16 where
@@ -91,17 +91,17 @@ class FootprintFcn(nn.Module):
         self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor, row: Tensor, footprint: Tensor,
         contents: Contents,
     ) -> Tensor:  # fmt: skip
-        """Return the scores of some footprints only, float32 ``[M, out_channels]``.
+        """Return the scores of the given footprints, float32 ``[M, out_channels]``.
 
         Args:
             bin_depth, tote_depth: ``[N, W_B, D_B]``, ``[N, W_T, D_T]``.
             bearing: 1 where a cell of the tote bears weight, else 0, ``[N, W_T, D_T]``.
-            row: int64 ``[M]``, which problem.
-            footprint: int64 ``[M]``, which footprint ``(parity * W_T + x) * D_T + y`` of it.
-            contents: the items in the bins, and which one each footprint is of.
+            row: index of the problem, int64 ``[M]``.
+            footprint: index ``(parity * W_T + x) * D_T + y`` of the footprint, int64 ``[M]``.
+            contents: the items in the bins, and the number of each footprint's item.
         """
         at_once = CHUNK_BYTES // (4 * self.patch.in_features)
-        if not torch.is_grad_enabled() and len(row) > at_once:  # of large totes: a part at a time, to save memory
+        if not torch.is_grad_enabled() and len(row) > at_once:  # large totes: a part at a time, to save memory
             split = (index.split(at_once) for index in (row, footprint, contents.number))
             parts = ((*part, contents._replace(number=number)) for *part, number in zip(*split, strict=True))
             return torch.cat([self.at(bin_depth, tote_depth, bearing, *part) for part in parts])
@@ -117,19 +117,19 @@ class FootprintFcn(nn.Module):
             if contents.items.x.shape[1] > 1:  # else a gradient of zeros would change the norm that clipping sees
                 x = x + F.linear(contents.rest_code(row, self.item_range).to(dtype), self.rest_of_bin)
             x = F.relu(self.hidden(F.relu(x)))
-        return self.head(x.float())[:count]  # in full: scores that differ a little must not be rounded to a tie
+        return self.head(x.float())[:count]  # float32: rounding must not make ties of scores that differ a little
 
     def _inputs(
         self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor, row: Tensor, footprint: Tensor,
         sizes: list[Tensor], dtype: torch.dtype,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        """Return the inputs of the first layer: ``[M, inputs]``, one-hot, cell by cell, then the five codes; and marks,
-        ``[M, side * side]``."""
+        """Return the inputs of the first layer, ``[M, inputs]``: the one-hot cells, then the five codes; and marks of
+        the cells that bear no weight, ``[M, side * side]``."""
         side, reach, (w, d, h) = self.receptive_field, self.reach, sizes
         _, wide, long = tote_depth.shape
         parity, x, y = split_footprint((wide, long), footprint)
         turned = parity == 1
-        # Patches begin some cells before their footprint along the item's own axes, to have it in their middle.
+        # Patches begin some cells before their footprint along the item's own axes, so that it is in their middle.
         before_w, before_d = (reference_cell(side) - reference_cell(size) for size in (w, d))
         margin = side + max(bin_depth.shape[1:])
         stride = long + 2 * margin
@@ -137,7 +137,7 @@ class FootprintFcn(nn.Module):
         y = y + margin - torch.where(turned, before_w, before_d)
         tap = torch.arange(side, device=row.device)
         steps = torch.stack([tap[:, None] * stride + tap, tap[:, None] + tap * stride]).flatten(1)
-        # Depths as small whole numbers: comparing a row of them is what takes the time.
+        # Depths as small whole numbers: comparing them takes most of the time.
         small = torch.int32 if torch.compiler.is_exporting() else torch.int16  # onnxruntime lacks int16
         depth = clip_depth(tote_depth, 8_000, floor=-900).to(small)
         deepest = depth.amax((1, 2)).clamp(min=self.tote_clip)[row]

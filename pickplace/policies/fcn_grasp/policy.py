@@ -1,4 +1,4 @@
-"""The default policy: 2D convolutions over the tote around each footprint, as the item there would see it."""
+"""The default policy: 2D convolutions over the tote around each footprint, relative to the item."""
 
 import torch
 from torch import Tensor, nn
@@ -34,10 +34,10 @@ class FcnGrasp(FootprintPolicy):
 
 
 class UnmaskedFcnGrasp(Policy):
-    """``fcn_grasp`` without a mask: chooses among (grasp class, place cell), feasible or not, or to miss the item.
+    """``fcn_grasp`` without a mask: chooses a (grasp class, place cell), feasible or not, or to miss the item.
 
     The grasp class says how the item lies under the rotated end effector. All picks that lift nothing are one more
-    choice, which the policy must learn to avoid, as it must learn walls, collisions and support.
+    choice. The policy must learn to avoid it, and it must learn walls, collisions and support.
 
     Args:
         cell: the sizes.
@@ -58,14 +58,14 @@ class UnmaskedFcnGrasp(Policy):
         self.register_buffer("scored", self._scored(), persistent=False)
 
     def _scored(self) -> Tensor:
-        """Return where among the network's scores each (grasp class, place cell) is found, int64 ``[C, W_T * D_T]``.
+        """Return the index of each (grasp class, place cell) among the network's scores, int64 ``[C, W_T * D_T]``.
 
-        The last score is that of every footprint that does not begin in the tote.
+        The last score is that of all footprints that do not begin in the tote.
         """
         (tote_w, tote_d, _), offsets, low = self.cell.tote_size, self.cell.num_offsets, self.cell.min_offset
         step, x, y = torch.arange(offsets), torch.arange(tote_w), torch.arange(tote_d)
         channel, found = torch.arange(offsets**2).view(offsets, offsets, 1, 1), []
-        for turn in range(num_grasp_turns(self.cell)):  # those of one parity have the same scores
+        for turn in range(num_grasp_turns(self.cell)):  # turns of one parity have the same scores
             parity, shape = turn % 2, self.cell.effector(turn)
             left = x[:, None] + (step[:, None, None, None] + low - shape.ref_x)  # [O, 1, W_T, 1]
             front = y + (step[:, None, None] + low - shape.ref_y)  # [O, 1, D_T]
@@ -85,7 +85,7 @@ class UnmaskedFcnGrasp(Policy):
         return torch.cat([scores, self.outside.expand(len(scores), 1)], 1)[:, self.scored]
 
     def _choices(self, observation: Observation) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the logit of each choice, and of each of its flat actions; and each pick's class."""
+        """Return the logit of each choice, the logit of each of its flat actions, and the class of each pick."""
         maps, places = self.class_scores(observation), self.cell.num_places
         logits = torch.cat([maps.flatten(1), self.miss.expand(len(maps), 1)], 1)
         picks = pick_classes(self.cell, item_from_depth(observation["bin_depth"]))

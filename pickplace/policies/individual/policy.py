@@ -19,7 +19,8 @@ EXCLUDES = "every pick but the heuristic one"
 
 
 def spread_over_actions(cell: CellSpec, log_probs: Tensor, pick: Tensor) -> Tensor:
-    """Return ``[N, W_T * D_T * R]`` with the pick cells ``[N]`` as ``[N, N_a]``, minus infinity for other picks."""
+    """Return log-probabilities ``[N, W_T * D_T * R]`` for the pick cells ``[N]`` as ``[N, N_a]``; minus infinity for
+    other picks."""
     number = torch.arange(log_probs.shape[1], device=pick.device)
     out = log_probs.new_full((len(log_probs), cell.num_actions), -torch.inf)
     return out.scatter_(1, join_pick(cell, pick[:, None], number), log_probs)
@@ -28,7 +29,7 @@ def spread_over_actions(cell: CellSpec, log_probs: Tensor, pick: Tensor) -> Tens
 class PlaceRotationPolicy(Policy):
     """Chooses place and rotation with the heuristic pick; subclasses score them.
 
-    With a mask, a state in which nothing can be placed with the heuristic pick is left unmasked; the action then fails.
+    With a mask, a state stays unmasked if nothing can be placed with the heuristic pick. Then the action fails.
     """
 
     choice_key = "place_rotation"
@@ -60,16 +61,16 @@ class PlaceRotationPolicy(Policy):
         pick = self._pick(observation)
         return spread_over_actions(self.cell, self.place_scores(observation, pick).log_softmax(-1), pick)
 
-    rank = Policy.rank  # that of :class:`Fcn4d` scores every pick
+    rank = Policy.rank  # Fcn4d.rank scores every pick
 
 
 class IndividualRl(PlaceRotationPolicy, Fcn4d):
     """``individual_rl``, with which the paper compares: only place and rotation are learnt (Sec. IV).
 
-    The network is that of ``fcn4d``; its features after the last ``3x3x3x3`` convolution are selected at the pick cell,
-    so that nothing else of them is computed.
+    The network is that of ``fcn4d``. Its features after the last ``3x3x3x3`` convolution are computed at the pick cell
+    only.
 
-    Args: as :class:`~pickplace.policies.fcn4d.policy.Fcn4d`.
+    Args: as in :class:`~pickplace.policies.fcn4d.policy.Fcn4d`.
     """
 
     def choice_logits(self, observation: Observation, choices: Tensor) -> Tensor:
@@ -81,9 +82,9 @@ class IndividualRl(PlaceRotationPolicy, Fcn4d):
 
 
 class UnmaskedIndividualGrasp(PlaceRotationPolicy, UnmaskedFcnGrasp):
-    """``individual_grasp`` without a mask: the network of ``fcn_grasp`` scores where the heuristic pick can place.
+    """``individual_grasp`` without a mask: the network of ``fcn_grasp`` scores the placements of the heuristic pick.
 
-    Args: as :class:`~pickplace.policies.fcn_grasp.policy.UnmaskedFcnGrasp`.
+    Args: as in :class:`~pickplace.policies.fcn_grasp.policy.UnmaskedFcnGrasp`.
     """
 
     def place_scores(self, observation: Observation, pick: Tensor) -> Tensor:
@@ -95,9 +96,9 @@ class UnmaskedIndividualGrasp(PlaceRotationPolicy, UnmaskedFcnGrasp):
 class IndividualGrasp(FootprintScorer):
     """``individual_grasp`` with a mask: chooses among the distinct footprints that the heuristic pick reaches.
 
-    In a state in which none of them is feasible it chooses among them all; the action then fails.
+    If none of them is feasible, it chooses among all of them. Then the action fails.
 
-    Args: as :class:`~pickplace.policies.fcn_grasp.policy.FcnGrasp`.
+    Args: as in :class:`~pickplace.policies.fcn_grasp.policy.FcnGrasp`.
     """
 
     mask = "action"
@@ -110,8 +111,8 @@ class IndividualGrasp(FootprintScorer):
         """Return the heuristic pick, the footprints that it leaves, and those to choose among.
 
         Returns:
-            the pick cell, int64 ``[N]``; the footprint for each place and rotation, int64 ``[N, W_T * D_T * R]``, -1
-            outside the tote; bool of the same shape.
+            the pick cell, int64 ``[N]``; the footprint of each place and rotation, int64 ``[N, W_T * D_T * R]``, -1
+            outside the tote; and a mask of those to choose among, bool of the same shape.
         """
         pick = heuristic_pick(self.cell, item_from_depth(observation["bin_depth"]))
         footprint = select_pick(self.cell, action_footprints(self.cell, items_from_observation(observation)), pick)

@@ -1,4 +1,4 @@
-"""Advance rules: when the level changes."""
+"""Advance rules, which decide when the level changes."""
 
 import math
 from collections import deque
@@ -16,7 +16,7 @@ class Tally:
     """Input of an advance rule: the level, and counts since it began.
 
     Attributes:
-        level: number of the level trained at now.
+        level: number of the current level.
         window: final occupancies of the latest episodes that were played at the level.
         frames: frames of the whole run.
         level_start: the run's frames when the level began.
@@ -63,16 +63,16 @@ class Advance:
     def update(self, tally: Tally) -> tuple[int, dict]:
         """Return the level from now on, and further numbers to log, by name; called after each batch.
 
-        A level beyond the first or the last is replaced by that.
+        A level before the first or after the last one is clipped.
         """
         raise NotImplementedError
 
     def weights(self) -> list[float]:
-        """Return how often new episodes begin at each level, from the first to the last; empty: by the sampler."""
+        """Return the weight of each level for the draw of new episodes, first to last; empty: the sampler draws."""
         return []
 
     def load_state(self, state: dict) -> None:
-        """Continue from saved values of the :attr:`state_keys`; ``ValueError`` for values that cannot be."""
+        """Continue from saved values of the :attr:`state_keys`; ``ValueError`` for impossible values."""
         vars(self).update(state)
 
     def least_frames(self, batch: int) -> float:
@@ -202,7 +202,7 @@ class Staged(Advance):
 
     Args:
         stages: ``{frames, level}`` each: from that frame of the run on, that level; None is the last one. ``frames``
-            ascend. Before the first stage it is the first level. Levels of heights may be called ``height``.
+            ascend. Before the first stage it is the first level. If levels are heights, the key may be ``height``.
     """
 
     def __init__(self, stages):

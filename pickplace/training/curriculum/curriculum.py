@@ -1,4 +1,4 @@
-"""The curriculum of a run: its level, its counts, and what a checkpoint stores of them."""
+"""The curriculum of a run: its level, its counts, and their state in a checkpoint."""
 
 import math
 from collections import deque
@@ -21,10 +21,10 @@ class Curriculum:
     Args:
         advance: an :class:`Advance` rule.
         sample: a sampler of levels, see :mod:`pickplace.training.curriculum.sample`.
-        start_height, end_height: a short form of levels that differ in the height of the tote alone: the first and the
-            last height, in height units; None: that of the tallest item, and the tote's full height.
-        levels: what each level sets, see :func:`~pickplace.training.curriculum.levels.read_levels`; None: as the
-            heights say.
+        start_height, end_height: a short form of levels that differ only in the height of the tote: the first and the
+            last height, in height units; None: the height of the tallest item, and the tote's full height.
+        levels: settings of each level, see :func:`~pickplace.training.curriculum.levels.read_levels`; None: levels of
+            these heights.
     """
 
     def __init__(
@@ -74,17 +74,17 @@ class Curriculum:
 
     @property
     def level(self) -> int:
-        """Number of the level trained at now; of levels of heights the height of the tote, in height units."""
+        """Number of the current level; if levels are heights, the height of the tote in height units."""
         return self.tally.level
 
     @property
     def what(self) -> str:
-        """Name of a level for a reader: ``tote height``, where levels are heights, or ``level``."""
+        """Name of a level to show: ``tote height`` if levels are heights, else ``level``."""
         return self.levels.key.replace("_", " ")
 
     @property
     def weights(self) -> list[float]:
-        """How often episodes begin at each level, as the rule says; empty: as the sampler draws."""
+        """Weight of each level for the draw of new episodes, by the rule; empty: the sampler draws."""
         weights, count = self.advance.weights(), self.end - self.start + 1
         are_numbers = isinstance(weights, list) and all(is_number(weight) and weight >= 0 for weight in weights)
         good = are_numbers and (not weights or len(weights) == count and sum(weights) > 0)
@@ -124,7 +124,7 @@ class Curriculum:
             Metrics to log: ``curriculum/level`` (from now on), ``/progress`` (0 at the first level, 1 at the last),
             ``/frames_at_level``, ``/episodes`` and ``/occupancy`` (number and windowed mean at the level; no mean
             without an episode), ``/occupancy_at_<level>`` (means of this batch), and the rule's own. Counts are
-            those that the rule decided on; a change of level clears them afterwards.
+            those on which the rule decided; a change of level clears them afterwards.
         """
         tally, levels, occupancy = self.tally, levels.reshape(-1), occupancy.reshape(-1).double()
         at_level = occupancy[levels == tally.level].tolist()
@@ -177,7 +177,7 @@ class Curriculum:
         """Continue from a :meth:`state_dict`; call it after :meth:`setup`.
 
         Raises:
-            ValueError: for the state of another advance rule, a level that there is not, or no such state.
+            ValueError: for the state of another advance rule, an unknown level, or anything that is no such state.
         """
         expect(
             isinstance(state, dict)

@@ -1,4 +1,4 @@
-"""What a level may set; without torch, so that a misspelt key of a command line is refused at once."""
+"""Keys of a level's settings. Torch is not imported, so that a misspelt key on a command line is refused at once."""
 
 from collections.abc import Mapping, Sequence
 

@@ -1,4 +1,4 @@
-"""Levels of a curriculum: what the episodes of each level set."""
+"""Levels of a curriculum: the settings of their episodes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -24,7 +24,7 @@ class Levels(NamedTuple):
     Attributes:
         first: number of the first level.
         key: entry of an observation that has the number of the episode's level.
-        entries: what an episode of each level is given at its reset, by entry: ``[L, width]``.
+        entries: values that episodes of each level get at a reset, by entry: ``[L, width]``.
         items: the item distribution with the mixes of the levels; None: that of the run.
         is_full: whether the last level is the full task.
     """
@@ -42,7 +42,7 @@ class Levels(NamedTuple):
 
     @property
     def varies(self) -> tuple[str, ...]:
-        """What the environment must let vary, see :data:`~pickplace.envs.episode.SETTINGS`."""
+        """Settings in which episodes of the environment may differ, see :data:`~pickplace.envs.episode.SETTINGS`."""
         return tuple(key for key in self.entries if key in SETTINGS)
 
 
@@ -55,8 +55,7 @@ def read_levels(given: Sequence[Mapping], cell: CellSpec, items: ItemDistributio
     """Return levels that are listed in a config, numbered from 1.
 
     Args:
-        given: of each level what it sets, see :mod:`pickplace.training.curriculum.keys`; the rest is that of the full
-            task.
+        given: settings of each level, see :mod:`pickplace.training.curriculum.keys`; the rest is that of the full task.
         cell, items: of the full task.
 
     Raises:
@@ -72,7 +71,7 @@ def read_levels(given: Sequence[Mapping], cell: CellSpec, items: ItemDistributio
     for place, level in zip(places, given, strict=True):
         row = {"tote_height": cell.tote_size[2], "level": len(rows) + 1}
         for key, value in level.items():
-            if key == "items":  # in the environment the number of a mix
+            if key == "items":  # the environment gets the number of the mix
                 with _prefixed(place):
                     items.mixed([value])
                 mixes += [value] * (value not in mixes)

@@ -11,7 +11,7 @@ from pickplace.common.validate import number
 
 
 class Current:
-    """Sampler: every episode plays at the level."""
+    """Sampler: every episode plays at the level reached."""
 
     def __call__(self, level: int, first: int, count: int) -> Tensor:
         return torch.full((count,), level, dtype=torch.int64)
@@ -25,7 +25,7 @@ class Uniform:
 
 
 class Recent:
-    """Sampler: the level, and a share of episodes at earlier ones to prevent forgetting.
+    """Sampler: the level reached, and a share of episodes at earlier levels to prevent forgetting.
 
     Args:
         share: probability in [0, 1] of an earlier level, drawn uniformly from torch's global generator.

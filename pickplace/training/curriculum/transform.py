@@ -1,4 +1,4 @@
-"""The TorchRL transform that writes episode settings into resets, and the way the level reaches it."""
+"""The TorchRL transform that writes episode settings into resets, and the function that sends it the level."""
 
 from collections.abc import Sequence
 
@@ -12,17 +12,17 @@ from pickplace.training.curriculum.levels import Levels
 
 
 class ToteHeightCurriculum(Transform):
-    """Write what a level sets, such as ``tote_height``, int64 ``[N, 1]``, into full and partial resets.
+    """Write the settings of levels, such as ``tote_height``, int64 ``[N, 1]``, into full and partial resets.
 
-    Running episodes keep theirs. It must be the first transform of the environment's ``Compose``, where
+    Running episodes keep their settings. It must be the first transform of the environment's ``Compose``, where
     :func:`push_level` finds it.
 
     Args:
         level: number of the first level.
         sampler: returns level numbers for ``(level, first, count)``; see
             :mod:`pickplace.training.curriculum.sample`.
-        levels: what each level sets.
-        weights: how often episodes begin at each level; empty: as the sampler draws.
+        levels: the levels and their settings.
+        weights: weight of each level for the draw; empty: the sampler draws.
     """
 
     def __init__(self, level: int, sampler, levels: Levels, weights: Sequence[float] = ()):
