@@ -35,6 +35,7 @@ class PictureValue(ToteValue):
     """
 
     in_keys = ("tote_depth", "tote_height", "items")
+    looks: Tensor
 
     def __init__(
         self,
@@ -112,10 +113,11 @@ class PictureValue(ToteValue):
     def _around_by_table(self, picture: Tensor) -> Tensor:
         """Return the output of the first convolution, ``[N, filters, *grid[:2]]``, channels last: for each cell the sum
         of table entries of the cells around it."""
-        weight, margin, (wide, deep, _) = self.around.weight, self.around.padding[0], self.grid
+        weight, (wide, deep, _) = self.around.weight, self.grid
         side = weight.shape[-1]
+        margin = side // 2
         table = self.looks @ weight.permute(2, 3, 1, 0)  # [side, side, looks, filters]
-        table[margin, margin] += self.around.bias  # with the cell itself, which is never outside
+        table[margin, margin] += self.around.get_parameter("bias")  # with the cell itself, which is never outside
         begins = torch.arange(side**2, dtype=torch.int32) * len(self.looks)
         padded = F.pad(picture, [margin] * 4)
         around = [padded[:, x : x + wide, y : y + deep] for x in range(side) for y in range(side)]
