@@ -9,7 +9,7 @@ from pickplace.rules.state import State
 class SoftDBL:
     """Draw a feasible footprint with probability ``softmax(-cost / temperature)``; deepest-bottom-left costs least.
 
-    The cost is the height of the item's top, and within a height the distance to the tote's origin.
+    The cost is the height of the item's top; among equal heights, less y costs less, then less x.
 
     Args:
         cell: the sizes; pickplace passes them.
