@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from pickplace.common.graphs import PLAIN, Compile
 from pickplace.common.validate import excerpt, refuse_any, refuse_if
 from pickplace.rules.observation import Term
 from pickplace.runs.checkpoint import matching_state
@@ -43,6 +44,7 @@ class Task:
         reward_scale: factor by which rewards are to be multiplied.
         num_envs: ``N``, environment slots.
         rollout_length: ``T``, steps of each slot in a batch.
+        compile: how the gradient step is compiled.
     """
 
     terms: Mapping[str, Term]
@@ -50,6 +52,7 @@ class Task:
     reward_scale: float
     num_envs: int
     rollout_length: int
+    compile: Compile = PLAIN
 
     @property
     def batch_frames(self) -> int:

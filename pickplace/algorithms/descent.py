@@ -1,14 +1,19 @@
 """Epochs of shuffled minibatches over a batch: the gradient steps of most algorithms."""
 
 import logging
-from collections.abc import Iterable
+import math
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from typing import NoReturn
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from pickplace.algorithms.base import Algorithm, At, Objective, Task, load_optimizer
+from pickplace.common.graphs import PLAIN, Work
+from pickplace.common.recording import is_recording
 from pickplace.common.validate import number, or_null, whole_number
 from pickplace.policies.base import Policy, as_collection_policy
 from pickplace.runs.checkpoint import matching_state
@@ -64,6 +69,7 @@ class MinibatchDescent(Algorithm):
         self.lr_decay_start = or_null(number, "algo.lr_decay_start", lr_decay_start, 0, 1)
         self.max_grad_norm = number("algo.max_grad_norm", max_grad_norm, 1e-9, MAX_WEIGHT)
         self.schedule: dict = {"settings": "", "since": 0}  # settings of the learning rate, and their first frame
+        self._steps: dict[Objective, Work] = {}  # compiled gradient steps
 
     def acting_policy(self) -> TensorDictModuleBase:
         return as_collection_policy(self.policy)
@@ -71,7 +77,11 @@ class MinibatchDescent(Algorithm):
     def use_parameters(self, parameters: Iterable[torch.nn.Parameter]) -> None:
         """Make the optimizer of these parameters."""
         self.parameters = [*parameters]
-        self.optimizer = torch.optim.Adam(self.parameters, lr=self.lr, eps=1e-5, fused=True)
+        device = self.parameters[0].device
+        # A recorded step reads the rate from the device.
+        rate = torch.tensor(self.lr, device=device) if self.task.compile.cudagraphs else self.lr
+        fused = {"fused": True, "capturable": device.type == "cuda"}
+        self.optimizer = torch.optim.Adam(self.parameters, lr=rate, eps=1e-5, **fused)
 
     def descend(self, data: TensorDictBase, at: At, objective: Objective) -> dict[str, float]:
         """Minimise an objective for ``epochs`` epochs of shuffled minibatches over frames ``[B]``.
@@ -86,29 +96,51 @@ class MinibatchDescent(Algorithm):
         if at.before == 0 and rate == 0 < self.lr:
             log.warning("total_frames=%d: the only batch has learning rate 0; nothing is learnt", at.total)
         for group in self.optimizer.param_groups:
-            group["lr"] = rate
+            if isinstance(group["lr"], Tensor):
+                group["lr"].fill_(rate)
+            else:
+                group["lr"] = rate
+        step = self._compiled_step(objective)
         history: list[dict[str, Tensor]] = []  # diagnostics of each step
         for _ in range(self.epochs):
             for index in torch.randperm(len(data), device=data.device).split(self.minibatch_size):
-                part = data[index]
-                total, losses = objective(part)
-                self.optimizer.zero_grad(set_to_none=True)
-                total.backward()
-                norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
-                if not torch.isfinite(norm + total.detach()):
-                    parts = {key: value.detach() for key, value in losses.items() if key.startswith("loss_")}
-                    values = {**parts, **part}.items()
-                    ranges = "; ".join(
-                        f"{key} {value_range(value)}" for key, value in values if value.is_floating_point()
-                    )
-                    raise FloatingPointError(
-                        f"the loss or its gradient is not finite: {ranges}; expected a smaller algo.lr."
-                    )
-                self.optimizer.step()
-                diagnostics = {name: losses[key].detach() for key, name in DIAGNOSTICS.items() if key in losses}
-                history.append({**diagnostics, "grad_norm": norm})
-        means = {f"train/{name}": float(sum(each[name] for each in history)) / len(history) for name in history[0]}
-        return {**means, "train/lr": rate}
+                history.append(step(data[index]))
+        sums = {name: float(sum(each[name] for each in history)) for name in history[0]}
+        losses = [sums[name] for name in sums if name.startswith(("loss_", "grad_norm"))]
+        if not all(map(math.isfinite, losses)):  # of recorded steps, which do not look
+            self._refuse_infinite(history[-1], data)
+        return {f"train/{name}": total / len(history) for name, total in sums.items()} | {"train/lr": rate}
+
+    def _compiled_step(self, objective: Objective) -> Callable[[TensorDictBase], dict[str, Tensor]]:
+        """Return the gradient step for an objective, of which a minibatch ``[B]`` is the input."""
+        if self.task.compile == PLAIN:
+            return partial(self._step, objective)
+        if objective not in self._steps:
+
+            def work(entries: dict[str, Tensor]) -> dict[str, Tensor]:
+                part = TensorDict(entries, next(iter(entries.values())).shape[:1])
+                return self._step(objective, part)
+
+            self._steps[objective] = self.task.compile.network(work, "the gradient step")
+        return lambda part: self._steps[objective](dict(part.items()))
+
+    def _step(self, objective: Objective, part: TensorDictBase) -> dict[str, Tensor]:
+        """Make a gradient step on a minibatch ``[B]``; return diagnostics."""
+        total, losses = objective(part)
+        self.optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
+        if not is_recording() and not torch.isfinite(norm + total.detach()):
+            self._refuse_infinite(losses, part)
+        self.optimizer.step()
+        diagnostics = {name: losses[key].detach() for key, name in DIAGNOSTICS.items() if key in losses}
+        return {**diagnostics, "grad_norm": norm}
+
+    def _refuse_infinite(self, losses: Mapping[str, Tensor], part: TensorDictBase) -> NoReturn:
+        parts = {key: value.detach() for key, value in losses.items() if key.startswith("loss_")}
+        values = {**parts, **part}.items()
+        ranges = "; ".join(f"{key} {value_range(value)}" for key, value in values if value.is_floating_point())
+        raise FloatingPointError(f"the loss or its gradient is not finite: {ranges}; expected a smaller algo.lr.")
 
     def learning_rate(self, at: At) -> float:
         """Return the learning rate of a batch; if it falls, a new run's last batch has 0."""

@@ -1,5 +1,7 @@
 """Proximal policy optimisation."""
 
+from torch import Tensor
+from torch.distributions import Distribution
 from torchrl.objectives import ClipPPOLoss
 
 from pickplace.algorithms.actor_critic import ActorCritic
@@ -21,10 +23,19 @@ class PPO(ActorCritic):
         super().__init__(*networks, **settings)
 
     def make_loss(self, **common) -> ClipPPOLoss:
-        return ClipPPOLoss(
+        return ClippedLoss(
             as_actor(self.policy),
             self.critic,
             clip_epsilon=self.clip_epsilon,
             normalize_advantage=self.normalize_advantage,
             **common,
         )
+
+
+class ClippedLoss(ClipPPOLoss):
+    """TorchRL's loss, of distributions that know their entropy."""
+
+    def _get_entropy(self, dist: Distribution, adv_shape) -> Tensor:
+        """Return the entropy. TorchRL also asks in each step whether it is finite, for which a GPU must wait; the
+        gradient step checks the whole loss."""
+        return dist.entropy()[..., None]

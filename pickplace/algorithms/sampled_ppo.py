@@ -9,10 +9,9 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.objectives import ClipPPOLoss
 
 from pickplace.algorithms.base import At
-from pickplace.algorithms.ppo import PPO
+from pickplace.algorithms.ppo import PPO, ClippedLoss
 from pickplace.algorithms.sampled_softmax import CANDIDATE_KEYS, as_sampled_actor, as_sampling_policy
 from pickplace.common.validate import expect, number, one_of, whole_number
 from pickplace.rules.item import Item
@@ -47,9 +46,9 @@ class SampledPPO(PPO):
             "gae with env.bin_items > 1 or env.preview > 0; vine knows one item in the bin alone",
         )
 
-    def make_loss(self, **common) -> ClipPPOLoss:
+    def make_loss(self, **common) -> ClippedLoss:
         # Advantages are normalised in prepare(): most of those that the loss sees are 0.
-        return ClipPPOLoss(as_sampled_actor(self.policy), self.critic, clip_epsilon=self.clip_epsilon, **common)
+        return ClippedLoss(as_sampled_actor(self.policy), self.critic, clip_epsilon=self.clip_epsilon, **common)
 
     def acting_policy(self) -> TensorDictModuleBase:
         return as_sampling_policy(self.policy, self.samples, self.temperature)

@@ -1,12 +1,13 @@
 """Checks of an environment: its memory, whether every item fits the empty tote, and the numbers that it is given."""
 
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 from itertools import product
 
 import numpy as np
 import torch
 
+from pickplace.common.recording import is_recording
 from pickplace.common.validate import at_most
 from pickplace.items.distributions import ItemDistribution
 from pickplace.items.tipping import longest_side
@@ -116,6 +117,18 @@ def check_numbers(key: str, values: torch.Tensor, low: int, high: int, expected:
     """Return whole numbers in ``[low, high]`` as int64; raise ``ValueError`` for others."""
     if not torch.can_cast(values.dtype, torch.int64):
         raise ValueError(f"{key}={values[0].item()} ({values.dtype}): expected whole numbers, as integers.")
-    if (bad := (values < low) | (values > high)).any():
-        raise ValueError(f"{key}={values[bad][0].item()}: expected {expected}.")
+    good = (values >= low) & (values <= high)
+    require(good, lambda bad: f"{key}={values[bad][0].item()}: expected {expected}.")
     return values.to(torch.int64)
+
+
+def require(good: torch.Tensor, message: Callable[[torch.Tensor], str]) -> None:
+    """Raise a ``ValueError`` unless all of ``good``, bool, is true; in a recording the device stops the program later.
+
+    Args:
+        message: returns the error's text, given where ``good`` is false.
+    """
+    if is_recording():
+        torch._assert_async(good.all())
+    elif not good.all():
+        raise ValueError(message(~good))

@@ -1,8 +1,7 @@
 """The environment: one TorchRL ``EnvBase`` that simulates a batch of bins and totes as tensors."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -11,37 +10,23 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from pickplace.common.machine import usable_device
+from pickplace.common.recording import is_recording
 from pickplace.common.validate import check_bytes, expect, one_of, or_null, refuse_if, whole_number
-from pickplace.envs.checks import check_items, check_numbers, most_items, problem_bytes
+from pickplace.envs.checks import check_items, check_numbers, most_items, problem_bytes, require
 from pickplace.envs.episode import RESET_ENTRIES, SETTINGS
+from pickplace.envs.masks import MASKS, MaskMaker
 from pickplace.items.arrival import coming_items, refill
 from pickplace.items.distributions import MAX_SEED, PAPER_KINDS, STREAMS, ItemDistribution, Kinds, check_seed
 from pickplace.items.tipping import check_tipping, longest_side, sizes_in_bin
 from pickplace.rules.bin import remove_item
-from pickplace.rules.cell import CELL_SETTINGS, CellSpec, cell_from_settings
+from pickplace.rules.cell import CELL_SETTINGS, cell_from_settings
 from pickplace.rules.item import ALL_TURNS, Item
-from pickplace.rules.masks import PlacingMaps, action_mask, choice_mask, corner_mask, placing_maps
 from pickplace.rules.observation import Term, check_terms, observe
 from pickplace.rules.pile import Pile
 from pickplace.rules.state import EMPTY, Episode, Failure, State
 from pickplace.rules.step import apply
 
 DONE_KEYS = ("done", "terminated", "truncated")
-CACHE_BYTES = 64 * 2**20  # of masks kept for the beginnings of episodes
-
-
-class Mask(NamedTuple):
-    """A mask that the environment can emit, bool ``[N, size]``."""
-
-    size: Callable[[CellSpec], int]
-    make: Callable[[CellSpec, PlacingMaps], Tensor]
-
-
-MASKS = {
-    "action": Mask(lambda cell: cell.num_actions, action_mask),
-    "footprint": Mask(lambda cell: cell.num_choices, choice_mask),
-    "corner": Mask(lambda cell: cell.num_choices, lambda cell, maps: maps.join(corner_mask(cell, maps))),
-}
 
 
 class PickPlaceEnv(EnvBase):
@@ -202,7 +187,7 @@ class PickPlaceEnv(EnvBase):
         for name, value in buffers.items():
             self.register_buffer(name, value)
         self.register_buffer("tallest", torch.tensor(tallest, device=self.device), persistent=False)  # of each mix
-        self._starts: dict[tuple, tuple[Tensor, ...]] = {}  # the masks of empty totes, see `_masks_of_empty_totes`
+        self._make_masks = MaskMaker(self.cell, self.masks)
         self.set_seed(seed)
 
     @property
@@ -250,7 +235,8 @@ class PickPlaceEnv(EnvBase):
             part.masked_fill_(rows.view(-1, *[1] * (part.dim() - 1)), 0)
         self._refill(rows, self.state.items)
         self._update_masks(rows, empty=True)
-        if (jammed := rows & ~self.feasible).any():  # the first one alone always has a feasible action
+        jammed = rows & ~self.feasible  # the first item alone always has a feasible action
+        if self.cell.bin_items > self.cell.poses and (is_recording() or jammed.any()):
             self.item[:, self.cell.poses :] *= ~jammed[:, None, None]
             self.arrived.masked_fill_(jammed, 1)
             self._look_ahead()
@@ -268,10 +254,15 @@ class PickPlaceEnv(EnvBase):
             found[setting.field] = check_numbers(key, wanted, low, high, f"between {low} and {high}")
         height = found["tote_height"]
         mix = found.get("item_mix", torch.zeros_like(height))
-        if (low_rows := height < self.tallest[mix]).any():
-            expected = f"at least {int(self.tallest[mix][low_rows][0])}, the height of the tallest item"
-            raise ValueError(f"tote_height={int(height[low_rows][0])}: expected {expected}.")
-        if self.cell.varies:
+        least = self.tallest[mix]
+        require(
+            height >= least,
+            lambda low: (
+                f"tote_height={int(height[low][0])}: expected at least {int(least[low][0])}, the height of the "
+                "tallest item."
+            ),
+        )
+        if self.cell.varies and not is_recording():
             turns = found.get("turns", torch.full_like(height, ALL_TURNS))
             for pair in {*zip(mix[rows].tolist(), turns[rows].tolist(), strict=True)} - self._checked_starts:
                 check_items(self.cell, self.items, *pair)
@@ -356,38 +347,23 @@ class PickPlaceEnv(EnvBase):
         Args:
             empty: the totes of these problems are empty.
         """
+        if is_recording():  # all rows, always, into the same tensors
+            masks = self._make_masks.of(self.state)
+            for name, old in [(name, self.get_buffer(f"{name}_mask")) for name in self.masks]:
+                old.copy_(torch.where(rows[:, None], masks[name], old))
+            self.feasible.copy_(torch.where(rows, _any(next(iter(masks.values()))), self.feasible))
+            return
         numbers = rows.nonzero()[:, 0]
         if len(numbers) == 0:
             return
         index = slice(None) if len(numbers) == len(rows) else numbers
-        make = self._masks_of_empty_totes if empty and self.device.type == "cpu" else self._masks_of
+        make = self._make_masks.of_empty_totes if empty and self.device.type == "cpu" else self._make_masks.of
         masks = make(self.state.rows(index))
-        mask = next(iter(masks.values()))
-        self.feasible[index] = mask.view(torch.uint8).amax(1) > 0  # the same as any(1), which is far slower on a CPU
+        self.feasible[index] = _any(next(iter(masks.values())))
         for name in self.masks:
             # A new tensor: the old one was handed out with an observation.
             old, new = getattr(self, f"{name}_mask"), masks[name]
             setattr(self, f"{name}_mask", new if len(numbers) == len(rows) else old.index_copy(0, numbers, new))
-
-    def _masks_of(self, state: State) -> dict[str, Tensor]:
-        """Return the masks to emit, or else ``footprint``, for the states of ``M`` problems, bool ``[M, ...]``."""
-        maps = placing_maps(self.cell, state)
-        return {name: MASKS[name].make(self.cell, maps) for name in self.masks or ("footprint",)}
-
-    def _masks_of_empty_totes(self, state: State) -> dict[str, Tensor]:
-        """Return the same as :meth:`_masks_of`, from a cache: episodes begin in few different states."""
-        item, tote_height = state.items.table.flatten(1), state.tote_height[:, None]
-        keys = [tuple(key) for key in torch.cat([item, tote_height], 1).tolist()]
-        if unseen := {key: row for row, key in enumerate(keys) if key not in self._starts}:
-            rows = torch.tensor(list(unseen.values()))
-            masks = self._masks_of(state.rows(rows))
-            if len(self._starts) * sum(mask.shape[1] for mask in masks.values()) > CACHE_BYTES:
-                self._starts = {key: self._starts[key] for key in keys if key in self._starts}
-            # Copies, since a view would keep all of its batch in memory.
-            parts = zip(*([row.clone() for row in mask] for mask in masks.values()), strict=True)
-            self._starts.update(zip(unseen, parts, strict=True))
-        columns = zip(*(self._starts[key] for key in keys), strict=True)
-        return dict(zip(self.masks or ("footprint",), map(torch.stack, columns), strict=True))
 
     def _observation(self) -> TensorDictBase:
         """Return the observation, with ``failure`` 0."""
@@ -395,5 +371,11 @@ class PickPlaceEnv(EnvBase):
         observation["occupancy"] = self.exact_occupancy.float()[:, None]
         observation["failure"] = torch.zeros_like(self.tote_height)[:, None]
         for name in self.masks:
-            observation[f"{name}_mask"] = getattr(self, f"{name}_mask")  # never written to again, see `_update_masks`
+            mask = getattr(self, f"{name}_mask")  # never written to again, except in a recording, see `_update_masks`
+            observation[f"{name}_mask"] = mask.clone() if is_recording() else mask
         return TensorDict(observation, batch_size=self.batch_size, device=self.device)
+
+
+def _any(mask: Tensor) -> Tensor:
+    """Return the same as ``mask.any(1)``, which is far slower on a CPU."""
+    return mask.view(torch.uint8).amax(1) > 0

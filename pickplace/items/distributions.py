@@ -15,6 +15,7 @@ from torch import Tensor
 from typing_extensions import Self
 
 from pickplace.common.files import read_table
+from pickplace.common.recording import constant_on
 from pickplace.common.validate import at_most, excerpt, expect, flag, is_number, is_whole, refuse_any, whole_number
 from pickplace.rules.item import ALL_TURNS, MAX_GRAMS, NO_LIMIT, Item
 
@@ -123,10 +124,10 @@ class ItemDistribution:
 
     def of_kind(self, kind: Tensor, across: Tensor, along: Tensor, bin_size) -> Item:
         """Return items of kinds, int64 ``[N]``, at places in the bin that two uniform numbers select, ``[N]``."""
-        item = place_at_random(self.sizes.to(kind.device)[kind], across, along, bin_size, kind)
+        item = place_at_random(constant_on(self.sizes, kind.device)[kind], across, along, bin_size, kind)
         if self.handling is None:
             return item
-        turns, grams, max_load = self.handling.to(kind.device)[kind].unbind(-1)
+        turns, grams, max_load = constant_on(self.handling, kind.device)[kind].unbind(-1)
         return item._replace(turns=turns, grams=grams, max_load=max_load)
 
     @property
@@ -227,7 +228,7 @@ class Kinds(ItemDistribution):
         return (edges + torch.arange(len(edges))[:, None]).flatten()
 
     def _index(self, uniform, step, mix=None):
-        edges = self._edges.to(uniform.device)
+        edges = constant_on(self._edges, uniform.device)
         if mix is None:
             return torch.searchsorted(edges[: len(self.sizes) - 1], uniform, right=True)
         # The clamp keeps the number below the next mix, in spite of rounding.
@@ -362,7 +363,7 @@ class Recorded(ItemDistribution):
     def sample(self, stream, seed, episode, step, bin_size, mix=None):
         item = super().sample(stream, seed, episode, step, bin_size, mix)
         if self.has_corners:
-            x, y = self._corner.to(step.device)[item.kind].unbind(-1)
+            x, y = constant_on(self._corner, step.device)[item.kind].unbind(-1)
             item = item._replace(x=x, y=y)
         return item if self._loop else item.map(lambda part: torch.where(step < len(self.sizes), part, 0))
 

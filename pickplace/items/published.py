@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from pickplace.common.files import MAX_TABLE_BYTES, read_file
+from pickplace.common.recording import constant_on
 from pickplace.common.validate import at_most, excerpt, expect, is_whole, or_null, refuse_if, reworded, size_tuple
 from pickplace.items.distributions import MAX_KINDS, MAX_LENGTH, ItemDistribution, hashed_uniform, place_at_random
 
@@ -69,17 +70,17 @@ class Published(ItemDistribution):
     def num_items(self, stream, seed, episode):
         if stream != "test":
             return self.drawn.num_items(stream, seed, episode)
-        return self._lengths.to(episode.device)[episode % len(self._lengths)]
+        return constant_on(self._lengths, episode.device)[episode % len(self._lengths)]
 
     def sample(self, stream, seed, episode, step, bin_size, mix=None):
         if stream != "test":
             return self.drawn.sample(stream, seed, episode, step, bin_size, **self.of_mix(mix))
         device, number = step.device, episode % len(self._lengths)
-        left = self._lengths.to(device)[number] - step
-        index = torch.where(left > 0, self._starts.to(device)[number] + step, 0)
-        kind = torch.where(left > 0, self._kinds.to(device)[index], -1)
+        left = constant_on(self._lengths, device)[number] - step
+        index = torch.where(left > 0, constant_on(self._starts, device)[number] + step, 0)
+        kind = torch.where(left > 0, constant_on(self._kinds, device)[index], -1)
         _, across, along = hashed_uniform(stream, seed, episode, step, 3)
-        item = place_at_random(self.sizes.to(device)[kind], across, along, bin_size, kind)
+        item = place_at_random(constant_on(self.sizes, device)[kind], across, along, bin_size, kind)
         return item.map(lambda part: torch.where(kind >= 0, part, 0))
 
     def mixed(self, changes):

@@ -7,6 +7,7 @@ the bin, too. Poses follow one another in the bin's table: upright as it arrives
 import torch
 from torch import Tensor
 
+from pickplace.common.recording import constant_on
 from pickplace.common.validate import expect, refuse_any, refuse_if
 from pickplace.items.distributions import ItemDistribution
 from pickplace.rules.cell import POSES, CellSpec
@@ -29,7 +30,7 @@ def in_pose(cell: CellSpec, source: ItemDistribution, item: Item, pose: int) -> 
         return item
     turns = item.turns
     if pose > 0 and source.tipped_turns is not None:
-        turns = source.tipped_turns.to(turns.device)[item.kind, pose - 1]
+        turns = constant_on(source.tipped_turns, turns.device)[item.kind, pose - 1]
     w, d, h = (getattr(item, side) for side in SIDES[pose])
     corner = torch.zeros_like(item.x)
     return Item(corner, corner, w, d, h, item.kind, turns, item.grams, item.max_load)

@@ -10,8 +10,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from pickplace.common.recording import is_recording
 from pickplace.common.validate import expect
-from pickplace.envs.torchrl import MASKS
+from pickplace.envs.masks import MASKS
 from pickplace.policies.base import MAP_KEYS, MASKED, Policy, Ranking, best_choice, pick_one
 from pickplace.policies.depth import Contents
 from pickplace.rules.cell import CellSpec
@@ -103,6 +104,8 @@ class FootprintScorer(Policy):
     def footprint_logits(self, observation: Observation, mask: Tensor) -> Tensor:
         """Return logits of footprints, computed only where a mask ``[N, M * Q * W_T * D_T]`` allows them; else
         :data:`MASKED`."""
+        if is_recording():
+            return torch.where(mask, self.unmasked_scores(observation), MASKED)
         row, footprint = mask.nonzero(as_tuple=True)
         scores = self.scores(observation, row, footprint)
         return scores.new_full(mask.shape, MASKED).index_put((row, footprint), scores)

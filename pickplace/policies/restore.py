@@ -18,7 +18,8 @@ from pickplace.common.machine import usable_device
 from pickplace.common.validate import expect, refuse_if
 from pickplace.config.allowlist import trusted_config
 from pickplace.config.registry import build, node_of
-from pickplace.envs.torchrl import MASKS, PickPlaceEnv
+from pickplace.envs.masks import MASKS
+from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.items.tipping import longest_side
 from pickplace.policies.base import EstimatesValue, Policy, as_collection_policy, as_critic
 from pickplace.rules.cell import CELL_SETTINGS, CellSpec, cell_from_settings

@@ -10,6 +10,7 @@ from functools import reduce
 import torch
 from torch import Tensor
 
+from pickplace.common.recording import is_recording
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import split_action
 from pickplace.rules.item import Item
@@ -40,7 +41,7 @@ def blocked_picks(cell: CellSpec, items: Item) -> Tensor | None:
     blocked = torch.zeros_like(touches)
     for other in range(count):
         in_the_way = items.h[:, other, None] >= items.h  # [N, M]
-        in_the_way[:, other] = False
+        in_the_way[:, other].fill_(False)
         blocked |= touches[..., other, None] & in_the_way
     return blocked.flatten(2).flatten(0, 1).t()
 
@@ -107,8 +108,8 @@ def remove_item(cell: CellSpec, items: Item, number: Tensor, removed: Tensor | N
 
 
 def must_share(items: Item, rows: Tensor) -> bool:
-    """Return whether any of the bins in ``rows``, bool ``[N]``, already holds an item. All of them must have room."""
-    return items.x.shape[1] > 1 and bool((rows & items.exists[:, 0]).any())
+    """Return whether any of the bins in ``rows``, bool ``[N]``, already holds an item, or may. All must have room."""
+    return items.x.shape[1] > 1 and (is_recording() or bool((rows & items.exists[:, 0]).any()))
 
 
 def add_item(items: Item, item: Item, rows: Tensor) -> Item:
@@ -192,7 +193,7 @@ def let_in(cell: CellSpec, state: State) -> State:
         if must_share(items, open_):
             item = find_room(cell, item, items, ~items.exists[:, 0], first.double())
         open_ = open_ & item.exists
-        if not open_.any():
+        if not is_recording() and not open_.any():
             break
         items, coming = add_item(items, item, open_), remove_item(cell, coming, first, open_)
     return state._replace(items=items, coming=coming)

@@ -10,13 +10,14 @@ wall around the tote: one maximum over its cells decides.
 """
 
 from collections.abc import Callable
-from functools import reduce
+from functools import lru_cache, reduce
 from itertools import product
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from pickplace.common.recording import is_recording
 from pickplace.common.validate import check_bytes
 from pickplace.rules.bin import blocked_picks
 from pickplace.rules.cell import CellSpec
@@ -70,7 +71,7 @@ class PlacingMaps(NamedTuple):
     def within_turns(self, cell: CellSpec) -> "PlacingMaps":
         """Return the maps without feasible actions in the rotations that the items forbid."""
         allowed = combine(TURN, flags_from_turns(self.item.turns, cell.rotations))[..., None, None]
-        each = self.clearance[:, [turn % self.clearance.shape[1] for turn in range(cell.rotations)]]
+        each = torch.stack([self.clearance[:, turn % self.clearance.shape[1]] for turn in range(cell.rotations)], 1)
         return self._replace(clearance=torch.where(allowed, each, FAR))
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "PlacingMaps":
@@ -184,7 +185,7 @@ def action_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
     # The flags of all rotations are packed into one number, so that a pick cell's whole block is copied at once. The
     # last of the blocks [N * K + 1, places] is empty, for picks that fail.
     packed, slots = {1: (torch.uint8, 1), 2: (torch.int16, 2)}.get(rotations, (torch.int32, 4))
-    flags = torch.eye(slots, dtype=torch.uint8).view(packed).flatten().tolist()
+    flags = _packed_flags(packed, slots)
     count, first = len(available), torch.arange(batch, device=by_class.device)
     blocks = by_class.new_zeros(batch * count + 1, places, dtype=packed)
     for bit, turned in zip(flags, classes, strict=False):
@@ -252,8 +253,8 @@ def corner_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
     top = maps.rest + maps.item.h.to(maps.rest.dtype).view(-1, 1, 1, 1)
     mask = feasible & _in_corner(maps, footprint_mask(cell, maps._replace(top=top)))
     bare = feasible.flatten(1).any(1) & ~mask.flatten(1).any(1)
-    if bare.any():
-        mask[bare] = feasible[bare] & _in_corner(maps, feasible)[bare]
+    if is_recording() or bare.any():  # rarely
+        mask = torch.where(bare.view(-1, 1, 1, 1), feasible & _in_corner(maps, feasible), mask)
     return mask
 
 
@@ -275,9 +276,20 @@ def _neighbours(maps: Tensor, axis: int, step: int, beyond) -> Tensor:
     return moved
 
 
+@lru_cache(maxsize=8)
+def _packed_flags(packed: torch.dtype, slots: int) -> list[int]:
+    """Return the number that holds a true flag in each of the slots alone."""
+    return torch.eye(slots, dtype=torch.uint8).view(packed).flatten().tolist()
+
+
 def _reference_cells(cell: CellSpec, device) -> Tensor:
     shapes = map(cell.effector, range(cell.rotations))
-    return torch.tensor([(shape.ref_x, shape.ref_y) for shape in shapes], device=device)  # [R, 2]
+    return _points(tuple((shape.ref_x, shape.ref_y) for shape in shapes), device)  # [R, 2]
+
+
+@lru_cache(maxsize=64)
+def _points(points: tuple[tuple[int, int], ...], device) -> Tensor:
+    return torch.tensor(points, device=device)
 
 
 def _footprint_margins(cell: CellSpec, parity: int) -> tuple[int, int, int, int]:

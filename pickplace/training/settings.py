@@ -9,7 +9,8 @@ from pickplace.common.validate import check_bytes, expect, flag, number, or_null
 from pickplace.config.allowlist import own_modules
 from pickplace.config.composition import use_whole_numbers
 from pickplace.envs.checks import problem_bytes
-from pickplace.envs.torchrl import MASKS, PickPlaceEnv
+from pickplace.envs.masks import MASKS
+from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.evaluation.play import check_episode_settings, check_play
 from pickplace.items.distributions import check_seed
 from pickplace.policies.base import Policy
@@ -32,6 +33,7 @@ CHECKS: dict = {
     "model.actor": _node,
     **dict.fromkeys(("model.critic", "warm_start.teacher"), partial(or_null, _node)),
     "callbacks": partial(or_null, _group),
+    "compile": partial(or_null, _node),
     **dict.fromkeys(("warm_start.checkpoint", "warm_start.weights"), partial(or_null, _text)),
     **dict.fromkeys(("warm_start.frames", "warm_start.critic_frames"), partial(whole_number, least=0)),
     **dict.fromkeys(("total_frames", "checkpoint_interval", "progress_interval"), whole_number),

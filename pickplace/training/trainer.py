@@ -15,6 +15,7 @@ from torchrl.envs import Compose, TransformedEnv
 
 from pickplace.algorithms.base import Algorithm, At, Task
 from pickplace.algorithms.imitation import WarmStart, with_warm_start
+from pickplace.common.graphs import PLAIN, Compile
 from pickplace.common.machine import use_machine
 from pickplace.common.validate import excerpt, expect, refuse_if
 from pickplace.config.registry import build
@@ -35,6 +36,7 @@ from pickplace.runs.resume import (
     stale_best_frames,
 )
 from pickplace.training import callbacks, collectors, settings
+from pickplace.training.compiled import CompiledPolicy, RecordedEnv
 from pickplace.training.curriculum.curriculum import Curriculum
 from pickplace.training.curriculum.transform import ToteHeightCurriculum, push_level
 from pickplace.training.progress import Progress, has_passed, results, terminal_bar
@@ -76,6 +78,7 @@ class Trainer:
         self.cfg, self.run_dir, self.resumed = cfg, run_dir, resume is not None
         self.saved_config, self.resume_overrides = checkpoint_config(cfg)
         self.device = use_machine(cfg)
+        self.compile: Compile = build("compile", cfg.compile) if cfg.get("compile") else PLAIN  # older runs have none
         torch.manual_seed(cfg.seed)
         self.state, facts, self.safe_folder = resume or ({}, {}, None)
         self.frames, self.iteration, self.best, self.latest = ({**NEW, **facts}[key] for key in NEW)
@@ -92,11 +95,13 @@ class Trainer:
         if shortage := self.curriculum.check_budget(cfg.total_frames, self.task.batch_frames):
             log.warning(shortage)
         self.acting = self.algorithm.acting_policy()
+        if self.compile != PLAIN:
+            self.acting = CompiledPolicy(self.acting, self.compile)
         base_env = partial(self.build_training_env, masks=self.policy.masks, episode_stride=cfg.env.num_envs)
         self.collector = build(
             "collector",
             cfg.collector,
-            make_env=partial(training_env, base_env, self.curriculum),
+            make_env=partial(training_env, base_env, self.curriculum, self.compile),
             policy=self.acting,
             num_envs=cfg.env.num_envs,
             rollout_length=cfg.rollout_length,
@@ -142,7 +147,7 @@ class Trainer:
         elif cfg.model.critic is not None:
             self.critic = self._restored("critic", lambda: as_critic(make("model.critic", cfg.model.critic)), weights)
         observation = self.build_training_env(num_envs=1, masks=self.policy.masks).observation_spec.zero()
-        self.task = Task(env.terms, observation, cfg.reward_scale, cfg.env.num_envs, cfg.rollout_length)
+        self.task = Task(env.terms, observation, cfg.reward_scale, cfg.env.num_envs, cfg.rollout_length, self.compile)
         algorithm = build("algo", cfg.algo, policy=self.policy, critic=self.critic, task=self.task)
         expect(isinstance(algorithm, Algorithm), "algo", algorithm, "an algorithm, such as algo=ppo")
         self.algorithm = with_warm_start(algorithm, self.warm_start)
@@ -353,10 +358,13 @@ class Trainer:
             write_report(run_dir, self.cfg, replayed, self.env.cell, made_with, self.curriculum, self.ended)
 
 
-def training_env(base_env, curriculum: Curriculum, first_episode: int, num_envs: int) -> TransformedEnv:
+def training_env(
+    base_env, curriculum: Curriculum, compile: Compile, first_episode: int, num_envs: int
+) -> TransformedEnv:
     """Make the environment of one collector process: slots ``first_episode ..``, under the curriculum."""
     levels = ToteHeightCurriculum(curriculum.level, curriculum.sample, curriculum.levels, curriculum.weights)
-    return TransformedEnv(base_env(first_episode=first_episode, num_envs=num_envs), Compose(levels))
+    env = base_env(first_episode=first_episode, num_envs=num_envs)
+    return RecordedEnv(env, levels, compile) if compile.cudagraphs else TransformedEnv(env, Compose(levels))
 
 
 def episode_metrics(batch: TensorDictBase) -> dict[str, float]:

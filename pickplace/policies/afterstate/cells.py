@@ -67,6 +67,7 @@ class CellsValue(ToteValue):
         self.layers = nn.ModuleList(nn.Conv2d(width, width, 3, padding=1) for _ in range(layers))
         self.means = nn.ModuleList(nn.Linear(width, width) for _ in range(layers))
         self.waiting = WaitingItems(width)
+        self.register_buffer("scale", torch.tensor([1.0, 1.0, 1.0 / self.level]), persistent=False)
         self.head = nn.Conv2d(width, self.joined**2, 1)
         nn.init.normal_(self.head.weight, std=0.01)
         nn.init.constant_(self.head.get_parameter("bias"), 0.5)
@@ -85,7 +86,7 @@ class CellsValue(ToteValue):
             x = self.around(F.pad(self._planes(depth, bearing, dtype), [1, self.patch] * 2)).relu_()
             for halve in self.halves:
                 x = halve(x).relu_()
-            x = x + self.waiting(items, depth.new_tensor([1.0, 1.0, 1.0 / self.level]))[:, :, None, None]
+            x = x + self.waiting(items, self.scale)[:, :, None, None]
             for layer, mean in zip(self.layers, self.means, strict=True):
                 x = x + (layer(x) + mean(x.mean((2, 3)))[:, :, None, None]).relu_()
         logits = F.conv2d(x.float(), self.head.weight, self.head.bias)

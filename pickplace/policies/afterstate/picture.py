@@ -90,8 +90,11 @@ class PictureValue(ToteValue):
     def _scale(self, depth: Tensor, height: Tensor) -> Tensor:
         """Return the factors that convert sides of items into cells and steps of the picture, float32 ``[N, 3]``."""
         wide, deep, steps = self.grid
-        sides = height.new_tensor([wide / depth.shape[1], deep / depth.shape[2]], dtype=torch.float32)
-        return torch.cat([sides.expand(len(height), 2), steps / height], 1)
+        along_z = steps / height[:, 0]
+        sides = (
+            torch.full_like(along_z, cells / side) for cells, side in zip((wide, deep), depth.shape[1:], strict=True)
+        )
+        return torch.stack([*sides, along_z], 1)
 
     @torch.no_grad()
     def _picture(self, depth: Tensor, height: Tensor) -> Tensor:

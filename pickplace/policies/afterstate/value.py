@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from pickplace.common.recording import is_recording
 from pickplace.common.validate import flag, number, one_of
 from pickplace.policies.dtypes import DTYPES
 
@@ -92,9 +93,17 @@ class ToteValue(nn.Module, ABC):
         """
         if not self.mirrored:
             return maps
-        turned, *flips = torch.rand(3).lt(0.5).tolist()
+        draws, (wide, deep) = torch.rand(3, device=maps[0].device) < 0.5, maps[0].shape[1:]
+        if is_recording():  # all views, of which the device selects one; a transposed map must have the same shape
+            views: list[tuple[list[int], bool]] = [([1], False), ([2], False), ([], True)]
+            for (axes, turned), drawn in zip(views, draws.roll(-1), strict=True):
+                if not turned or (wide == deep and self.may_turn(wide, deep)):
+                    pairs = zip(maps, seen_from(maps, axes, turned), strict=True)
+                    maps = tuple(torch.where(drawn, new, old) for old, new in pairs)
+            return maps
+        turned, *flips = draws.tolist()
         axes = [axis for axis, flipped in zip((1, 2), flips, strict=True) if flipped]
-        return seen_from(maps, axes, turned and self.may_turn(*maps[0].shape[1:]))
+        return seen_from(maps, axes, turned and self.may_turn(wide, deep))
 
     def may_turn(self, wide: int, deep: int) -> bool:
         """Return whether a tote of these sides may be transposed."""
@@ -112,6 +121,7 @@ def seen_from(entries: Sequence[Tensor], axes: list[int], turned: bool) -> tuple
 
 def _seen_from(entry: Tensor, axes: list[int], turned: bool) -> Tensor:
     if not entry.is_floating_point():
-        return entry[..., [1, 0, 3, 2, 4]] if turned else entry  # positions in the bin do not matter
+        y, x, d, w, h = entry.unbind(-1)  # positions in the bin do not matter
+        return torch.stack([x, y, w, d, h], -1) if turned else entry
     flipped = entry.flip(axes)
     return flipped.transpose(1, 2) if turned else flipped

@@ -134,7 +134,7 @@ class Contact:
         """
         exact = exact_dtype(self.side)
         w, d = self.w.short(), self.d.short()
-        left = right = torch.tensor(-inf, dtype=exact, device=w.device)  # steepest to the far side, and to the near
+        left = right = torch.full((), -inf, dtype=exact, device=w.device)  # steepest to the far side, and to the near
         for x, ends in enumerate(self.ends()):
             offset = (2 * x + 1 - w).to(exact)
             beyond = torch.where(ends > 0, 2 * ends - 1 - d, -inf).to(exact)

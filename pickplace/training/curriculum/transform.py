@@ -47,13 +47,17 @@ class ToteHeightCurriculum(Transform):
         expect(good and first <= drawn.min() and drawn.max() <= last, "curriculum.sample: its levels", drawn, expected)
         return drawn.reshape(-1).cpu()
 
+    def draw(self, batch_size: torch.Size) -> dict[str, Tensor]:
+        """Return the settings of new episodes, by their names, ``[*batch_size, ...]`` each."""
+        level = self._draw(batch_size.numel()) - self.levels.first
+        device = self.level.device
+        return {key: entries[level].to(device).reshape(*batch_size, -1) for key, entries in self.levels.entries.items()}
+
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase:
         if tensordict is None:  # a plain env.reset()
             tensordict = TensorDict(batch_size=self.parent.batch_size, device=self.parent.device)
-        count = tensordict.numel()
-        level, reset = self._draw(count), tensordict.get("_reset", None)
-        for key, entries in self.levels.entries.items():
-            value = entries[level - self.levels.first].to(self.level.device).reshape(*tensordict.batch_size, -1)
+        reset = tensordict.get("_reset", None)
+        for key, value in self.draw(tensordict.batch_size).items():
             # Collectors hide these from a reset; running rows then get drawn values too, which nothing reads.
             if reset is not None and (running := tensordict.get(key, None)) is not None:
                 value = torch.where(reset.reshape(*tensordict.batch_size, 1), value, running)

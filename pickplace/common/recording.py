@@ -1,0 +1,41 @@
+"""Recording of GPU work: a CUDA graph repeats the same work, so that its shapes and its course must not depend on data.
+
+Code that could save work by looking at results, such as skipping rows that did not change, asks :func:`is_recording`.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+import torch
+from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
+
+_RECORDING = ContextVar("recording", default=False)
+_COPIES = WeakTensorKeyDictionary()  # constant -> its copy by device
+
+
+@contextmanager
+def recording() -> Iterator[None]:
+    """Within this context, code has fixed shapes and reads nothing back from the device."""
+    token = _RECORDING.set(True)
+    try:
+        yield
+    finally:
+        _RECORDING.reset(token)
+
+
+def is_recording() -> bool:
+    """Return whether shapes must be fixed, and nothing may be read back from the device."""
+    return _RECORDING.get()
+
+
+def constant_on(constant: Tensor, device: torch.device) -> Tensor:
+    """Return a tensor that never changes on a device. Its copy is kept: to copy it in each step would make a GPU wait,
+    and a recording must not copy from the CPU at all."""
+    if constant.device == device:
+        return constant
+    copies = _COPIES.setdefault(constant, {})
+    if device not in copies:
+        copies[device] = constant.to(device)
+    return copies[device]

@@ -1,0 +1,68 @@
+"""The compiled forms of the two parts of a collector: the acting policy, and the environment."""
+
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import Compose, TransformedEnv
+
+from pickplace.common.graphs import Compile, Work
+from pickplace.envs.torchrl import PickPlaceEnv
+from pickplace.training.curriculum.transform import ToteHeightCurriculum
+
+
+class CompiledPolicy(TensorDictModuleBase):
+    """An acting policy whose work is compiled in the process that calls it first.
+
+    Args:
+        policy: reads and writes TensorDicts ``[N]``, always with the same ``N``.
+        compile: how.
+    """
+
+    def __init__(self, policy: TensorDictModuleBase, compile: Compile):
+        super().__init__()
+        self.policy, self.how = policy, compile
+        self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
+        self._compiled: Work | None = None
+
+    def forward(self, frames: TensorDictBase) -> TensorDictBase:
+        if self._compiled is None:
+            self._compiled = self.how.network(self._act, "the acting policy")
+        return frames.update(self._compiled({key: frames[key] for key in self.in_keys}))
+
+    def _act(self, entries: dict[str, Tensor]) -> dict[str, Tensor]:
+        frames = self.policy(TensorDict(entries, next(iter(entries.values())).shape[:1]))
+        return {key: frames[key] for key in self.out_keys}
+
+
+class RecordedEnv(TransformedEnv):
+    """A training environment whose step, with the resets that follow it, is one recorded piece of work.
+
+    It returns the same as TorchRL's ``step_and_maybe_reset``. The levels of new episodes are drawn on the CPU in every
+    step, because the recorded work cannot say whether an episode has ended.
+
+    Args:
+        env: the environment.
+        levels: the curriculum.
+        compile: how the work is compiled.
+    """
+
+    def __init__(self, env: PickPlaceEnv, levels: ToteHeightCurriculum, compile: Compile):
+        super().__init__(env, Compose(levels))
+        self._compiled = compile.steps(self._advance, "the environment")
+
+    def reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+        state = super().reset(tensordict, **kwargs)
+        # Copies: recorded work writes into the environment's own masks.
+        return state.update({key: state[key].clone() for key in state.keys() if key.endswith("_mask")})  # noqa: SIM118
+
+    def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        settings = self.transform[0].draw(self.batch_size)
+        result = self._compiled({"action": tensordict["action"], **settings})
+        entries = {part: TensorDict(result[part], self.batch_size, self.device) for part in ("next", "root")}
+        return tensordict.set("next", entries["next"]), entries["root"]
+
+    def _advance(self, entries: dict[str, Tensor]) -> dict:
+        """Step, reset the problems that are done; return what the step led to, and from where the next one starts."""
+        after = self.base_env._step(TensorDict({"action": entries.pop("action")}, self.batch_size))
+        start = self.base_env._reset(TensorDict({"_reset": after["done"], **entries}, self.batch_size))
+        return {"next": dict(after.items()), "root": dict(start.items())}
