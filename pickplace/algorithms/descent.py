@@ -80,8 +80,8 @@ class MinibatchDescent(Algorithm):
         device = self.parameters[0].device
         # A recorded step reads the rate from the device.
         rate = torch.tensor(self.lr, device=device) if self.task.compile.cudagraphs else self.lr
-        fused = {"fused": True, "capturable": device.type == "cuda"}
-        self.optimizer = torch.optim.Adam(self.parameters, lr=rate, eps=1e-5, **fused)
+        on_gpu = device.type == "cuda"
+        self.optimizer = torch.optim.Adam(self.parameters, lr=rate, eps=1e-5, fused=True, capturable=on_gpu)
 
     def descend(self, data: TensorDictBase, at: At, objective: Objective) -> dict[str, float]:
         """Minimise an objective for ``epochs`` epochs of shuffled minibatches over frames ``[B]``.

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import tensordict
 import torch
+import torchrl
 from tensordict.nn import CudaGraphModule
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -20,8 +22,6 @@ Work = Callable[[dict[str, Tensor]], dict[str, Tensor]]
 
 #: Modes of ``torch.compile``.
 MODES = ("default", "reduce-overhead", "max-autotune", "max-autotune-no-cudagraphs")
-
-ROOT = Path(__file__).parents[1]
 
 
 @dataclass(frozen=True)
@@ -127,9 +127,9 @@ class ReadsBack(TorchDispatchMode):
 
 
 def _own_line() -> str:
-    """Return the innermost line of pickplace, or of the user, that is running."""
-    own = Path(__file__)
-    frames = [frame for frame in traceback.extract_stack() if Path(frame.filename) != own]
-    ours = [frame for frame in frames if ROOT in Path(frame.filename).parents]
-    frame = (ours or frames)[-1]
-    return f"{Path(frame.filename).name}:{frame.lineno}"
+    """Return the innermost line that is running and belongs to pickplace, or to the user."""
+    others = [Path(module.__path__[0]) for module in (torch, tensordict, torchrl)] + [Path(__file__)]
+    frames = [(Path(frame.filename), frame.lineno) for frame in traceback.extract_stack()]
+    own = [frame for frame in frames if not any(other in (frame[0], *frame[0].parents) for other in others)]
+    path, line = own[-1]
+    return f"{path.name}:{line}"

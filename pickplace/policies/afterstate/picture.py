@@ -91,10 +91,8 @@ class PictureValue(ToteValue):
         """Return the factors that convert sides of items into cells and steps of the picture, float32 ``[N, 3]``."""
         wide, deep, steps = self.grid
         along_z = steps / height[:, 0]
-        sides = (
-            torch.full_like(along_z, cells / side) for cells, side in zip((wide, deep), depth.shape[1:], strict=True)
-        )
-        return torch.stack([*sides, along_z], 1)
+        along_x, along_y = (torch.full_like(along_z, ratio) for ratio in (wide / depth.shape[1], deep / depth.shape[2]))
+        return torch.stack([along_x, along_y, along_z], 1)
 
     @torch.no_grad()
     def _picture(self, depth: Tensor, height: Tensor) -> Tensor:

@@ -1,0 +1,209 @@
+"""Recorded work: it does what the plain work does, with fixed shapes, and never looks at a result on the way."""
+
+import pytest
+import torch
+from commands import TINY, composed
+from problems import SETTINGS, late_state
+from tensordict import TensorDict
+from test_presets import ONE_NETWORK
+
+from pickplace import PickPlaceEnv
+from pickplace.common.graphs import Compile, ReadsBack, Recorded
+from pickplace.common.recording import recording
+from pickplace.planners.heuristics import RandomFeasible
+from pickplace.policies.afterstate.cells import CellsValue
+from pickplace.runs.loggers import read_csv
+from pickplace.training.train import train
+from pickplace.training.trainer import Trainer
+
+MASKS = ("action", "footprint", "corner")
+
+
+def recorded(work, *arguments):
+    """Return the result of recorded work, and the places where it looks at results."""
+    with recording(), ReadsBack() as found:
+        return work(*arguments), found.places
+
+
+def assert_equal(found: TensorDict, expected: TensorDict):
+    assert found.keys() == expected.keys()
+    for key, value in expected.items():
+        assert torch.equal(found[key], value), key
+
+
+@pytest.mark.parametrize("settings", [*SETTINGS, {"num_envs": 4, "handling": True, "bin_items": 2, "preview": 1}])
+def test_a_recorded_environment_does_the_same(settings):
+    """Through full and partial resets, successes and failures; an observation stays as it was handed out."""
+    plain, other = (PickPlaceEnv(**settings, masks=MASKS, seed=3) for _ in range(2))
+    planner, generator, count = RandomFeasible(plain.cell), torch.Generator().manual_seed(0), plain.num_envs
+    everything = TensorDict({"_reset": torch.ones(count, 1, dtype=torch.bool)}, [count])
+    state = plain._reset(everything)
+    assert_equal(recorded(other._reset, everything)[0], state)
+    for step in range(25):
+        action = planner.decide(state)
+        if step % 5 == 4:
+            action = torch.randint(plain.cell.num_actions, action.shape, generator=generator)
+        act = TensorDict({"action": action}, [count])
+        after = plain._step(act)
+        found, places = recorded(other._step, act)
+        assert_equal(found, after)
+        again = TensorDict({"_reset": after["done"]}, [count])
+        state = plain._reset(again)
+        start, more = recorded(other._reset, again)
+        assert_equal(start, state)
+        assert_equal(found, after)
+        # In the first calls constants are made.
+        assert step == 0 or places + more == []
+
+
+def test_an_action_out_of_range_stops_a_recorded_environment():
+    env = PickPlaceEnv(num_envs=1)
+    env.reset()
+    with recording(), pytest.raises(RuntimeError):
+        env._step(TensorDict({"action": torch.tensor([env.cell.num_actions])}, [1]))
+
+
+@pytest.mark.parametrize(
+    ("work", "place"),
+    [
+        (lambda x: x["a"] * x["a"].sum().item(), "_local_scalar_dense"),
+        (lambda x: x["a"].nonzero(), "nonzero"),
+        (lambda x: x["a"][x["a"] > 0], "index.Tensor"),
+        (lambda x: x["a"] + torch.tensor(1.0), "lift_fresh"),
+    ],
+)
+def test_work_that_looks_at_results_is_refused(work, place):
+    """With the line where it does."""
+    step = Recorded(lambda x: {"b": work(x)}, "the gradient step")
+    step({"a": torch.ones(3)})
+    with pytest.raises(ValueError, match=rf"the gradient step .*\({place} in test_compile.py:\d+\); expected compile"):
+        step({"a": torch.ones(3)})
+
+
+def test_work_of_another_shape_is_not_recorded():
+    step = Recorded(lambda x: {"b": 2 * x["a"]}, "")
+    for count in (3, 2, 3):
+        assert step({"a": torch.ones(count)})["b"].tolist() == [2] * count
+    assert step.calls == 2
+
+
+@pytest.mark.parametrize("key", ["compile", "compile_mode", "cudagraphs"])
+def test_a_wrong_setting_is_named(key):
+    with pytest.raises(ValueError, match=f"compile.{key}=3: expected"):
+        Compile(**{key: 3})
+
+
+@pytest.mark.parametrize("sides", [(5, 5), (4, 6)])
+def test_a_view_of_a_recorded_tote_is_one_of_the_same(sides):
+    """A tote that is not square is mirrored only: a transposed one has another shape."""
+    net, depth = CellsValue(), torch.rand(1, *sides)
+    items = torch.tensor([[[0, 1, 2, 3, 4]]])
+    views = {}
+    for seed in range(60):
+        torch.manual_seed(seed)
+        expected = net.random_view(depth, items)
+        torch.manual_seed(seed)
+        found, places = recorded(net.random_view, depth, items)
+        assert places == [] or seed == 0
+        if sides[0] == sides[1]:
+            assert all(map(torch.equal, found, expected))
+        views[tuple(found[0].flatten().tolist())] = found
+    assert len(views) == (8 if sides[0] == sides[1] else 4)
+
+
+#: Trainings whose parts are all recorded, and whether the recorded steps are as exact as the plain ones.
+TRAININGS = {
+    "ppo": (["algo=ppo"], False),
+    "a2c": (["algo=a2c"], False),
+    "sampled_ppo": (["model=fcn4d", "model.mask_infeasible=false", "algo=sampled_ppo"], False),
+    "masked fcn4d": (["model=fcn4d", "algo=sampled_ppo"], False),
+    "individual": (["model=individual_rl", "algo=sampled_ppo", "algo.advantages=gae"], False),
+    "td": (["experiment=afterstate"], True),
+    "td by cells": (["experiment=afterstate", "model=afterstate_fcn"], True),
+    "a warm start": (["warm_start=imitate", "warm_start.frames=16", "warm_start.critic_frames=16"], False),
+}
+
+
+def words(name: str) -> list[str]:
+    tiny = ONE_NETWORK if name.startswith("td") else TINY
+    size = "env.tote_size=[6,6,3]"  # for the receptive field of fcn4d
+    return [*TRAININGS[name][0], *tiny, size, "total_frames=64", "curriculum=none", "evaluation_interval=64"]
+
+
+@pytest.mark.parametrize("name", TRAININGS)
+def test_a_training_learns_the_same_recorded(name, tmp_path, no_report):
+    """The first batch has the same metrics up to rounding, after which draws may differ; values draw the same."""
+    rows = {}
+    for option in ("none", "cudagraphs"):
+        train(composed(*words(name), f"compile={option}"), tmp_path / option)
+        rows[option] = read_csv(tmp_path / option / "metrics.csv")
+    compared = rows["none"] if TRAININGS[name][1] else rows["none"][:1]
+    for plain, found in zip(compared, rows["cudagraphs"], strict=False):
+        keys = {key for key in plain if not key.startswith("time/")}
+        assert keys == {key for key in found if not key.startswith("time/")}
+        for key in keys:
+            assert found[key] == pytest.approx(plain[key], rel=1e-3, abs=1e-5), key
+
+
+@pytest.mark.parametrize("collector", ["single", "multi_sync"])
+def test_a_recorded_collector_returns_the_same_entries(collector, tmp_path):
+    """And a curriculum reaches its environment."""
+    batches = []
+    for option in ("none", "cudagraphs"):
+        cfg = composed(*TINY, f"collector={collector}", f"compile={option}", "curriculum=paper")
+        (tmp_path / option).mkdir()
+        trainer = Trainer(cfg, tmp_path / option)
+        with trainer.running():
+            batches.append(next(iter(trainer.collector)).exclude("collector", ("next", "collector")))
+    plain, found = batches
+    assert sorted(found.keys(True, True), key=str) == sorted(plain.keys(True, True), key=str)
+    assert found.shape == plain.shape
+    assert set(found["tote_height"].flatten().tolist()) == {1}
+
+
+def test_items_that_are_made_on_the_cpu_are_refused(tmp_path):
+    cfg = composed(*TINY, "benchmark=cut1", "env.tote_size=[10,10,10]", "compile=cudagraphs")
+    with pytest.raises(ValueError, match=r"the environment looks at results while it runs \(.*cut.py"):
+        train(cfg, tmp_path)
+
+
+def test_infinite_gradients_of_recorded_steps_are_refused(tmp_path):
+    cfg = composed(*TINY, "compile=cudagraphs", "reward_scale=1e38")
+    with pytest.raises(FloatingPointError, match="the loss or its gradient is not finite"):
+        train(cfg, tmp_path)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("name", TRAININGS)
+def test_a_gpu_repeats_a_recorded_training(name, tmp_path, no_report):
+    """Six batches: two to begin, one to record, three that are repeated; compared as on a CPU."""
+    losses = {}
+    for option in ("none", "cudagraphs"):
+        cfg = composed(*words(name), "total_frames=96", f"compile={option}", "device=cuda")
+        train(cfg, tmp_path / option)
+        losses[option] = read_csv(tmp_path / option / "metrics.csv")[0]
+    for key, value in losses["none"].items():
+        if not key.startswith("time/"):
+            assert losses["cudagraphs"][key] == pytest.approx(value, rel=1e-2, abs=1e-3), key
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_gpu_repeats_a_recorded_environment():
+    """The repeated steps equal the plain ones of the same actions."""
+    env, observation = late_state(steps=2, num_envs=16, device="cuda", masks=MASKS)
+    twin = PickPlaceEnv(num_envs=16, device="cuda", masks=MASKS)
+    twin.load_state_dict(env.state_dict())
+
+    def advance(entries):
+        after = twin._step(TensorDict(entries, [16]))
+        start = twin._reset(TensorDict({"_reset": after["done"]}, [16]))
+        return {"after": dict(after.items()), "start": dict(start.items())}
+
+    step, planner = Recorded(advance, "the environment"), RandomFeasible(env.cell)
+    for _ in range(20):
+        action = planner.decide(observation)
+        after = env._step(TensorDict({"action": action}, [16]))
+        observation = env._reset(TensorDict({"_reset": after["done"]}, [16]))
+        result = step({"action": action})
+        assert_equal(TensorDict(result["after"], [16]), after)
+        assert_equal(TensorDict(result["start"], [16]), observation)
