@@ -63,8 +63,7 @@ def training(result: dict) -> str:
     parts = " | ".join(next(iter(result["trainings"].values()))["share"])
     return section(
         "Parts of the training time",
-        "The share of a batch's time that each part takes, in the median batch, on all cores. `paper` and "
-        "`paper_fast` train the same network without a mask.",
+        "The share of a batch's time that each part takes, in the median batch, on all cores.",
         table(f"`experiment=` | frames/s | {parts}", rows),
     )
 
