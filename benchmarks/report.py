@@ -8,12 +8,13 @@ from common import RESULTS
 PAGE = Path(__file__).parent.parent / "docs" / "performance.md"
 HEAD = """# Performance
 
-After {seconds:.0f} s of training on two CPU cores (`experiment=quick threads=null`), {good} of {seeds} policies fill
-97.5% of the paper's tote. On one core the environment makes {steps:,} steps/s with 256 problems, and a decision takes
-{decision:.0f} ms.
+- **Training.** {good} of {seeds} trainings reach an occupancy of 0.975 in at most {seconds:.0f} s, on two CPU cores
+  (`experiment=quick threads=null`).
+- **Environment.** 256 parallel environments make {steps:,} steps/s on one core.
+- **Decision.** A policy decides in {decision:.0f} ms on one core.
 
-`make bench` measures all this on an idle machine, and writes this page from `benchmarks/results/`. Times are medians,
-with the 10th to 90th percentile in brackets, with `env=paper`. There are no measurements on a GPU.
+`make bench` measures the tables on an idle machine, and writes this page. Settings are those of `env=paper`, except in
+the answers to a robot. Times are medians, with the 10th to 90th percentile in brackets. Nothing was measured on a GPU.
 """
 
 
@@ -47,10 +48,10 @@ def learning(result: dict) -> str:
         rows.append([run["seed"], *cells, f"{occupancy:.3f}", f"{seconds:.0f} s, {frames:,} frames"])
     return section(
         "Time until the tote is packed well",
-        "`experiment=quick` at `6x6x5`, `R=4`, on all cores, from the start of the process. Every 50,000 frames "
-        "a validation plays 128 episodes. Seed 0 trains to the end; the others stop when they reach "
-        f"{marks[-1]}. No time before the first validation can be seen.",
-        table(f"seed | {' | '.join(f'until {mark}' for mark in marks)} | last occupancy | time and frames then", rows),
+        "`experiment=quick` at 6x6x5, R=4, on all cores. Times count from the start of the process. A validation of "
+        "128 episodes follows every 50,000 frames, so no earlier time can appear. Seed 0 trains to the end; the "
+        f"others stop at {marks[-1]}.",
+        table(f"seed | {' | '.join(f'until {mark}' for mark in marks)} | occupancy at the end | end", rows),
     )
 
 
@@ -62,8 +63,7 @@ def training(result: dict) -> str:
     parts = " | ".join(next(iter(result["trainings"].values()))["share"])
     return section(
         "Parts of the training time",
-        "Frames per second of the median batch, on all cores, and the share of its time that each part takes. "
-        "`paper` and `paper_fast` train the same network without a mask.",
+        "The share of a batch's time that each part takes, in the median batch, on all cores.",
         table(f"`experiment=` | frames/s | {parts}", rows),
     )
 
@@ -76,8 +76,7 @@ def workers(result: dict) -> str:
     ]
     return section(
         "Worker processes",
-        f"Time to collect a batch and to learn from it, in {result['repeats']} trainings of {result['frames']:,} "
-        "frames.",
+        f"Time to collect and learn from one batch, in {result['repeats']} trainings of {result['frames']:,} frames.",
         table("training | `collector=` | ms | speed-up", rows),
     )
 
@@ -91,9 +90,9 @@ def environment(result: dict) -> str:
         rows.append(cells)
     return section(
         "Environment",
-        "A call of `step_and_maybe_reset`, which also finds the mask over all 3,600 actions, at the paper's sizes. The "
-        f"peer is {result['peer'] or 'not installed'} with `BinPack-v2`, compiled by JAX. Its task differs: the "
-        "ratio of the steps/s compares only the cost of a step. Both were measured in turn.",
+        "A call of `step_and_maybe_reset` at the paper's sizes, with the mask over all 3,600 actions. The peer is "
+        f"{result['peer'] or 'not installed'} with `BinPack-v2`, compiled by JAX. It has another task, so the ratio "
+        "compares only the cost of a step.",
         table("batch | ms | steps/s | peer, ms | peer, steps/s | ratio", rows),
     )
 
@@ -105,8 +104,8 @@ def decision(result: dict) -> str:
     )
     return section(
         "One decision",
-        "Milliseconds for one state, `R=4`: the network, and the mask or the `K` candidates that are tried. *Growth*: "
-        f"the time in the last tote divided by that in the first; the area grows {result['area grows by']:.0f} times.",
+        "Milliseconds for one state, R=4: the network, then the mask (K=all) or the trial of K candidates. *Growth*: "
+        f"the time at 30x30x10 divided by the time at 6x6x5; the area grows {result['area grows by']:.0f} times.",
         table(f"policy | {' | '.join(totes)} | growth", rows),
     )
 
@@ -120,8 +119,8 @@ def answers(result: dict) -> str:
     rows = [(what, *(f"{figures[key]:.0f}" for key in keys)) for what, figures in asked]
     return section(
         "One answer to a robot",
-        "Milliseconds for a call of `Planner.plan` with ten alternatives, in cells and in metres, from an empty tote "
-        "to a full one.",
+        "Milliseconds for a call of `Planner.plan` with ten alternatives, over totes from empty to full, in cells and "
+        "in metres.",
         table("what | median | 95th percentile | slowest", rows),
     )
 
