@@ -14,8 +14,9 @@ HEAD = """# Performance
 - **Decision.** A policy decides in {decision:.0f} ms on one core.
 
 `make bench` measures the tables on an idle machine, and writes this page. Settings are those of `env=paper`, except in
-the answers to a robot. Times are medians, with the 10th to 90th percentile in brackets. Nothing was measured on a GPU.
+the answers to a robot. Times are medians, with the 10th to 90th percentile in brackets.{gpu}
 """
+NO_GPU = " Nothing was measured on a GPU: `python benchmarks/gpu.py` does it there, and adds a section."
 
 
 def time(figures: dict) -> str:
@@ -125,10 +126,42 @@ def answers(result: dict) -> str:
     )
 
 
+def gpu(result: dict) -> str:
+    """Return the section of benchmarks/gpu.py: the environment, the trainings, and the time to a good policy."""
+
+    def steps(row: dict) -> list[str]:
+        return [f"{row['ms']:,.1f}", f"{row['steps/s']:,.0f}"]
+
+    environment = []
+    for problems, row in result["environment"].items():
+        share = f"{row['recorded']['device ms'] / row['recorded']['ms']:.0%}"
+        peer = steps(row["jumanji"]) if "jumanji" in row else ["", ""]
+        environment.append([problems, *steps(row["plain"]), *steps(row["recorded"]), share, *peer])
+    trainings = [
+        [
+            f"`{name}`, {key}",
+            *(f"{row[part]:,.0f}" for part in ("collect ms", "learn ms", "frames/s")),
+            f"{row['busy']:.0%}",
+        ]
+        for name, both in result["trainings"].items()
+        for key, row in both.items()
+    ]
+    reached = result["seconds until the mark"]
+    words = f"after {reached:.0f} s, from the start of the process" if reached else "not at all"
+    return section(
+        "A GPU",
+        f"On {result['device']}. *Recorded* is `compile=cudagraphs`; *busy* is the share of the time in which the "
+        f"device works. `experiment=quick_gpu` reaches {result['mark']} {words}.",
+        table("batch | plain, ms | steps/s | recorded, ms | steps/s | busy | Jumanji, ms | steps/s", environment),
+        table("`experiment=` | collect a batch, ms | learn, ms | frames/s | busy", trainings),
+    )
+
+
 def main() -> None:
     results = {path.stem: json.loads(path.read_text()) for path in RESULTS.glob("*.json")}
     sections = []
-    for write in (learning, training, workers, environment, decision, answers):
+    written = (learning, training, workers, environment, decision, answers)
+    for write in (*written, *([gpu] if "gpu" in results else [])):
         result = results[write.__name__]
         sections.append(f"{write(result)}\n{machine(result)}.\n")
     batch, seeds = results["environment"]["batches"]["256"], results["learning"]["ours"]
@@ -138,6 +171,7 @@ def main() -> None:
         "good": len(reached),
         "seeds": len(seeds),
         "steps": batch["pickplace"]["steps_per_second"] // 1000 * 1000,
+        "gpu": "" if "gpu" in results else NO_GPU,
         "decision": next(iter(results["decision"]["rows"].values()))["6x6x5"]["ms"],
     }
     profiles = (Path(__file__).parent / "profiles.md").read_text()

@@ -31,6 +31,7 @@ def test_every_preset_runs(name, tmp_path, monkeypatch):
     extra = [f"env.tote_size={sizes[name]}".replace(" ", "")] if name in sizes else []
     extra += ["items.depth=[9,10]"] * (name == "warehouse")  # fewer kinds
     extra += ["warm_start.weights=null"] * (name in ("mixed_bin3", "buffer"))  # of another size than these networks
+    extra += ["device=cpu"] * name.endswith("_gpu")
     tiny = TINY if composed(f"experiment={name}")["model"]["critic"] else ONE_NETWORK
     assert 0 <= train(composed(f"experiment={name}", *tiny, *extra), tmp_path) <= 1
     assert [row["frames"] for row in read_csv(tmp_path / "metrics.csv")] == [16]
