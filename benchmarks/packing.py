@@ -1,7 +1,8 @@
 """Play the public packing benchmarks, without a gripper and with one: python benchmarks/packing.py
 
-Writes docs/results/packing.csv and the tables of docs/benchmarks.md after each row, and prints the row. All rows take
-hours. `--match` plays only some, such as `^cut1`, and keeps the others; `--tables` plays none.
+Writes docs/results/packing.csv, leaderboard.png beside it, and the tables of docs/benchmarks.md after each row, and
+prints the row. All rows take hours. `--match` plays only some, such as `^cut1`, and keeps the others; `--tables` plays
+none.
 """
 
 import argparse
@@ -14,6 +15,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from common import ROOT, evaluate
+
+from pickplace.views.figures import COLOURS, INK, figure_of
 
 TABLE, PAGE = ROOT / "docs" / "results" / "packing.csv", ROOT / "docs" / "benchmarks.md"
 PLATES = {"plate_3x3": 3, "plate_5x5": 5}
@@ -38,6 +41,8 @@ PUBLISHED = {
     "cut1": ("Zhao 73.4", ""),
     "cut2": ("Zhao 66.9", ""),
 }
+#: The benchmarks in the figure.
+LABELS = {"gopt_rs": "GOPT", "pct1": "PCT", "cdrl_rs": "Zhao, random", "cut1": "Zhao, CUT-1", "cut2": "Zhao, CUT-2"}
 COLUMNS = ("benchmark", "effector", "rotations", "planner", "episodes", "mean", "low", "high")
 COLUMNS += ("kept", "kept_low", "kept_high", "ms")
 
@@ -143,9 +148,37 @@ def gripper_table(lines: dict[str, dict]) -> list[str]:
     return made
 
 
+def draw(lines: dict[str, dict]) -> None:
+    """Draw ours beside the published results."""
+    figure, names = figure_of(7, 3.2), list(LABELS)[::-1]
+    axes = figure.subplots()
+    for place, name in enumerate(names):
+        published = sorted(re.findall(r"(\w+) ([\d.]+)", " ".join(PUBLISHED[name])), key=lambda each: float(each[1]))
+        ours = 100 * float(lines[Row(name, "point", TRAINED[name], "learned").name]["mean"])
+        axes.plot([float(published[0][1]), ours], [place] * 2, color="#d9d9d9", lw=2, zorder=1)
+        for number, (method, value) in enumerate(published):
+            axes.plot(float(value), place, "o", color=COLOURS[-1], ms=7)
+            raised = 7 if number % 2 == 0 else -15  # else the names of neighbours would overlap
+            at = {"xytext": (0, raised), "textcoords": "offset points", "ha": "center"}
+            axes.annotate(method, (float(value), place), fontsize=8, color=INK, **at)
+        axes.plot(ours, place, "o", color=COLOURS[5], ms=10)
+        at = {"xytext": (9, 0), "textcoords": "offset points", "va": "center"}
+        axes.annotate(f"{ours:.1f}", (ours, place), color=COLOURS[5], weight="bold", **at)
+    axes.set_yticks(range(len(names)), [LABELS[name] for name in names])
+    axes.set(ylim=(-0.6, len(names) - 0.4), xlabel="filled share of the tote, %")
+    axes.margins(x=0.08)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(colors=INK)
+    axes.plot([], [], "o", color=COLOURS[5], ms=10, label="pickplace")
+    axes.plot([], [], "o", color=COLOURS[-1], ms=7, label="published")
+    axes.legend(loc="lower right", frameon=False)
+    figure.savefig(TABLE.with_name("leaderboard.png"), dpi=120)
+
+
 def write_page() -> None:
-    """Write both tables into the page."""
+    """Write both tables into the page, and draw the figure."""
     lines, text = read(), PAGE.read_text()
+    draw(lines)
     for name, table in {"leaderboard": leaderboard(lines), "gripper": gripper_table(lines)}.items():
         pattern = re.compile(rf"(<!-- {name}: [^\n]*-->\n).*?(<!-- end -->)", re.DOTALL)
         text = pattern.sub(lambda found, table=table: "\n".join([found[1], *table, "", found[2]]), text)
