@@ -77,11 +77,10 @@ class MinibatchDescent(Algorithm):
     def use_parameters(self, parameters: Iterable[torch.nn.Parameter]) -> None:
         """Make the optimizer of these parameters."""
         self.parameters = [*parameters]
-        device = self.parameters[0].device
-        # A recorded step reads the rate from the device.
-        rate = torch.tensor(self.lr, device=device) if self.task.compile.cudagraphs else self.lr
-        on_gpu = device.type == "cuda"
-        self.optimizer = torch.optim.Adam(self.parameters, lr=rate, eps=1e-5, fused=True, capturable=on_gpu)
+        device, recorded = self.parameters[0].device, self.task.compile.cudagraphs
+        rate = torch.tensor(self.lr, device=device) if recorded else self.lr  # a recorded step reads it from there
+        capturable = recorded and device.type == "cuda"
+        self.optimizer = torch.optim.Adam(self.parameters, lr=rate, eps=1e-5, fused=True, capturable=capturable)
 
     def descend(self, data: TensorDictBase, at: At, objective: Objective) -> dict[str, float]:
         """Minimise an objective for ``epochs`` epochs of shuffled minibatches over frames ``[B]``.
@@ -90,7 +89,8 @@ class MinibatchDescent(Algorithm):
             Mean diagnostics and the learning rate, ``train/...``.
 
         Raises:
-            FloatingPointError: if the loss or its gradient is not finite.
+            FloatingPointError: if the loss or its gradient is not finite; with recorded steps after the batch, when the
+                weights are not finite either.
         """
         rate = self.learning_rate(at)
         if at.before == 0 and rate == 0 < self.lr:

@@ -1,5 +1,6 @@
 """Compiled work: ``torch.compile``, and CUDA graphs, which a GPU repeats without Python (config group ``compile``)."""
 
+import logging
 import os
 import traceback
 from collections.abc import Callable
@@ -20,8 +21,8 @@ from pickplace.common.validate import flag, one_of, or_null, refuse_if
 #: A function of tensors by name. All tensors of a recorded one are detached; its shapes are fixed.
 Work = Callable[[dict[str, Tensor]], dict[str, Tensor]]
 
-#: Modes of ``torch.compile``.
-MODES = ("default", "reduce-overhead", "max-autotune", "max-autotune-no-cudagraphs")
+#: Modes of ``torch.compile`` without graphs of its own.
+MODES = ("default", "max-autotune-no-cudagraphs")
 
 
 @dataclass(frozen=True)
@@ -74,55 +75,67 @@ class Recorded:
 
     def __init__(self, work: Work, what: str):
         self.work, self.what = work, what
-        self.graph = work
-        if torch.cuda.is_available():
-            os.environ.setdefault("EXCLUDE_TD_FROM_PYTREE", "1")  # else CudaGraphModule warns that it sees to it
-            self.graph = CudaGraphModule(work, warmup=3)
-        self.calls, self.shapes = 0, dict[str, torch.Size]()
+        self.calls, self.graph = 0, work
+        self.kinds: dict[str, tuple[torch.Size, torch.dtype]] = {}  # shape and type of each input
 
     def __call__(self, inputs: dict[str, Tensor]) -> dict[str, Tensor]:
-        shapes = {key: value.shape for key, value in inputs.items()}
-        self.shapes = self.shapes or shapes
+        kinds = {key: (value.shape, value.dtype) for key, value in inputs.items()}
+        if not self.kinds:
+            self.kinds, self.graph = kinds, self._make_graph(next(iter(inputs.values())).device)
         with recording():
-            if shapes != self.shapes:
+            if kinds != self.kinds:
                 return self.work(inputs)
             self.calls += 1
+            ordered = {key: inputs[key] for key in self.kinds}  # the graph's inputs have places, not names
             if self.calls != 2:
-                return self.graph(inputs)
+                return self.graph(ordered)
             with ReadsBack() as found:
-                result = self.graph(inputs)
+                result = self.graph(ordered)
         places = "; ".join(dict.fromkeys(found.places))
         message = f"{self.what} looks at results while it runs ({places}); expected compile=none."
         refuse_if(places, f"compile.cudagraphs=true: {message}")
         return result
 
+    def _make_graph(self, device: torch.device) -> Work:
+        if device.type == "cpu":
+            return self.work
+        torch.cuda.set_device(device)  # the graph's streams are there
+        os.environ.setdefault("EXCLUDE_TD_FROM_PYTREE", "1")  # else CudaGraphModule warns that it sees to it
+        logging.getLogger("tensordict").setLevel(logging.WARNING)  # it reports each graph
+        # The work runs twice with the same inputs when it is recorded, so it must not change their dict.
+        return CudaGraphModule(lambda inputs: self.work({**inputs}), warmup=3)
+
 
 class ReadsBack(TorchDispatchMode):
     """Finds operations that a CUDA graph cannot hold: those that read results back, or whose shapes depend on data.
 
+    On a CPU, ``tolist`` and ``numpy`` are not seen; a GPU copies for them, which is.
+
     Attributes:
-        places: the operations, each with the line of pickplace that called it.
+        places: the operations, each with the line of pickplace or of the user that called it.
     """
 
     FORBIDDEN = (
-        "aten::_local_scalar_dense", "aten::nonzero", "aten::masked_select", "aten::_unique2", "aten::unique_dim",
-        "aten::repeat_interleave.Tensor", "aten::lift_fresh",
+        "_local_scalar_dense", "nonzero", "masked_select", "masked_scatter", "_unique", "_unique2", "unique_dim",
+        "unique_consecutive", "repeat_interleave.Tensor", "lift_fresh", "equal", "multinomial", "bincount",
     )  # fmt: skip
-    INDEXED = ("aten::index.Tensor", "aten::index_put", "aten::index_put_")
+    INDEXED = ("index.Tensor", "index_put", "index_put_")
 
     def __init__(self):
         super().__init__()
         self.places: list[str] = []
 
     def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        name = function.name()
+        name = function.name().removeprefix("aten::")
         bad = name in self.FORBIDDEN
         if name in self.INDEXED:
             bad = any(index is not None and index.dtype == torch.bool for index in args[1])
-        if name == "aten::_to_copy" and (device := (kwargs or {}).get("device")) is not None:
+        if name == "_to_copy" and (device := (kwargs or {}).get("device")) is not None:
             bad = torch.device(device).type != args[0].device.type
+        if name == "copy_":
+            bad = args[0].device.type != args[1].device.type
         if bad:
-            self.places.append(f"{name.removeprefix('aten::')} in {_own_line()}")
+            self.places.append(f"{name} in {_own_line()}")
         return function(*args, **(kwargs or {}))
 
 
@@ -131,5 +144,4 @@ def _own_line() -> str:
     others = [Path(module.__path__[0]) for module in (torch, tensordict, torchrl)] + [Path(__file__)]
     frames = [(Path(frame.filename), frame.lineno) for frame in traceback.extract_stack()]
     own = [frame for frame in frames if not any(other in (frame[0], *frame[0].parents) for other in others)]
-    path, line = own[-1]
-    return f"{path.name}:{line}"
+    return f"{own[-1][0].name}:{own[-1][1]}" if own else "the backward pass"  # it has a thread of its own on a GPU

@@ -15,12 +15,12 @@ class CompiledPolicy(TensorDictModuleBase):
 
     Args:
         policy: reads and writes TensorDicts ``[N]``, always with the same ``N``.
-        compile: how.
+        how: how it is compiled.
     """
 
-    def __init__(self, policy: TensorDictModuleBase, compile: Compile):
+    def __init__(self, policy: TensorDictModuleBase, how: Compile):
         super().__init__()
-        self.policy, self.how = policy, compile
+        self.policy, self.how = policy, how
         self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
         self._compiled: Work | None = None
 
@@ -38,17 +38,18 @@ class RecordedEnv(TransformedEnv):
     """A training environment whose step, with the resets that follow it, is one recorded piece of work.
 
     It returns the same as TorchRL's ``step_and_maybe_reset``. The levels of new episodes are drawn on the CPU in every
-    step, because the recorded work cannot say whether an episode has ended.
+    step, because the recorded work cannot say whether an episode has ended. Its state must not be loaded after a step:
+    recorded work keeps the addresses of the masks.
 
     Args:
         env: the environment.
         levels: the curriculum.
-        compile: how the work is compiled.
+        how: how the work is compiled.
     """
 
-    def __init__(self, env: PickPlaceEnv, levels: ToteHeightCurriculum, compile: Compile):
+    def __init__(self, env: PickPlaceEnv, levels: ToteHeightCurriculum, how: Compile):
         super().__init__(env, Compose(levels))
-        self._compiled = compile.steps(self._advance, "the environment")
+        self._compiled = how.steps(self._advance, "the environment")
 
     def reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
         state = super().reset(tensordict, **kwargs)
@@ -63,6 +64,7 @@ class RecordedEnv(TransformedEnv):
 
     def _advance(self, entries: dict[str, Tensor]) -> dict:
         """Step, reset the problems that are done; return what the step led to, and from where the next one starts."""
-        after = self.base_env._step(TensorDict({"action": entries.pop("action")}, self.batch_size))
-        start = self.base_env._reset(TensorDict({"_reset": after["done"], **entries}, self.batch_size))
+        after = self.base_env._step(TensorDict({"action": entries["action"]}, self.batch_size))
+        settings = {key: value for key, value in entries.items() if key != "action"}
+        start = self.base_env._reset(TensorDict({"_reset": after["done"], **settings}, self.batch_size))
         return {"next": dict(after.items()), "root": dict(start.items())}

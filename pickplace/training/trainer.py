@@ -358,13 +358,11 @@ class Trainer:
             write_report(run_dir, self.cfg, replayed, self.env.cell, made_with, self.curriculum, self.ended)
 
 
-def training_env(
-    base_env, curriculum: Curriculum, compile: Compile, first_episode: int, num_envs: int
-) -> TransformedEnv:
+def training_env(base_env, curriculum: Curriculum, how: Compile, first_episode: int, num_envs: int) -> TransformedEnv:
     """Make the environment of one collector process: slots ``first_episode ..``, under the curriculum."""
     levels = ToteHeightCurriculum(curriculum.level, curriculum.sample, curriculum.levels, curriculum.weights)
     env = base_env(first_episode=first_episode, num_envs=num_envs)
-    return RecordedEnv(env, levels, compile) if compile.cudagraphs else TransformedEnv(env, Compose(levels))
+    return RecordedEnv(env, levels, how) if how.cudagraphs else TransformedEnv(env, Compose(levels))
 
 
 def episode_metrics(batch: TensorDictBase) -> dict[str, float]:

@@ -1,20 +1,24 @@
 """Recorded work: it does what the plain work does, with fixed shapes, and never looks at a result on the way."""
 
+from functools import partial
+
 import pytest
 import torch
 from commands import TINY, composed
-from problems import SETTINGS, late_state
+from emulated_graphs import Graph, emulate
+from problems import SETTINGS
 from tensordict import TensorDict
 from test_presets import ONE_NETWORK
 
 from pickplace import PickPlaceEnv
 from pickplace.common.graphs import Compile, ReadsBack, Recorded
 from pickplace.common.recording import recording
+from pickplace.config.registry import build
 from pickplace.planners.heuristics import RandomFeasible
 from pickplace.policies.afterstate.cells import CellsValue
 from pickplace.runs.loggers import read_csv
 from pickplace.training.train import train
-from pickplace.training.trainer import Trainer
+from pickplace.training.trainer import Trainer, training_env
 
 MASKS = ("action", "footprint", "corner")
 
@@ -70,6 +74,8 @@ def test_an_action_out_of_range_stops_a_recorded_environment():
         (lambda x: x["a"].nonzero(), "nonzero"),
         (lambda x: x["a"][x["a"] > 0], "index.Tensor"),
         (lambda x: x["a"] + torch.tensor(1.0), "lift_fresh"),
+        (lambda x: x["a"].multinomial(1), "multinomial"),
+        (lambda x: x["a"] if torch.equal(x["a"], x["a"]) else -x["a"], "equal"),
     ],
 )
 def test_work_that_looks_at_results_is_refused(work, place):
@@ -85,6 +91,23 @@ def test_work_of_another_shape_is_not_recorded():
     for count in (3, 2, 3):
         assert step({"a": torch.ones(count)})["b"].tolist() == [2] * count
     assert step.calls == 2
+
+
+def test_the_order_of_the_inputs_does_not_matter(monkeypatch):
+    emulate(monkeypatch)
+    step, one, two = Recorded(lambda x: {"c": x["a"] - x["b"]}, ""), torch.ones(2), torch.full((2,), 5.0)
+    for _ in range(4):
+        assert step({"a": two, "b": one})["c"].tolist() == [4.0, 4.0]
+    assert step({"b": one, "a": two})["c"].tolist() == [4.0, 4.0]
+    assert Graph.replays == 2
+
+
+def test_a_repeated_step_that_keeps_a_number_is_found_by_the_emulator(monkeypatch):
+    """The emulator itself: Python that would not run again on a GPU does not run again here."""
+    emulate(monkeypatch)
+    calls = []
+    step = Recorded(lambda x: {"b": x["a"] + len(calls)} if calls.append(1) is None else {}, "")
+    assert [step({"a": torch.zeros(1)})["b"].item() for _ in range(5)] == [1, 2, 3, 4, 4]
 
 
 @pytest.mark.parametrize("key", ["compile", "compile_mode", "cudagraphs"])
@@ -173,37 +196,50 @@ def test_infinite_gradients_of_recorded_steps_are_refused(tmp_path):
         train(cfg, tmp_path)
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.fixture(params=["emulated", "cuda"])
+def device(request, monkeypatch):
+    """The device of recorded work that is repeated, by an emulator on a CPU or by a GPU."""
+    if request.param == "cuda":
+        return "cuda" if torch.cuda.is_available() else pytest.skip("needs a GPU")
+    emulate(monkeypatch)
+    return "cpu"
+
+
 @pytest.mark.parametrize("name", TRAININGS)
-def test_a_gpu_repeats_a_recorded_training(name, tmp_path, no_report):
-    """Six batches: two to begin, one to record, three that are repeated; compared as on a CPU."""
-    losses = {}
-    for option in ("none", "cudagraphs"):
-        cfg = composed(*words(name), "total_frames=96", f"compile={option}", "device=cuda")
-        train(cfg, tmp_path / option)
-        losses[option] = read_csv(tmp_path / option / "metrics.csv")[0]
-    for key, value in losses["none"].items():
-        if not key.startswith("time/"):
-            assert losses["cudagraphs"][key] == pytest.approx(value, rel=1e-2, abs=1e-3), key
+def test_a_repeated_training_equals_one_that_runs_each_time(name, device, tmp_path, monkeypatch, no_report):
+    """Through validations, another size of the last minibatch, and new heights of the tote."""
+    rows = {}
+    for option in ("repeated", "run"):
+        if option == "run":
+            assert device == "cuda" or Graph.replays > 20
+            monkeypatch.setattr(Recorded, "_make_graph", lambda self, device: self.work)
+        more = ["compile=cudagraphs", f"device={device}", "total_frames=128", "evaluation_interval=48"]
+        more += ["algo.minibatch_size=6", "curriculum=paper", "curriculum.advance.frames_per_level=32"]
+        train(composed(*words(name), *more), tmp_path / option)
+        rows[option] = read_csv(tmp_path / option / "metrics.csv")
+    assert [row["curriculum/level"] for row in rows["run"]][::2] == [1, 2, 3, 3]
+    compared = rows["run"] if device == "cpu" else rows["run"][:5]  # rounding differs, and then the draws
+    for plain, found in zip(compared, rows["repeated"], strict=device == "cpu"):
+        for key, value in plain.items():
+            if not key.startswith("time/"):
+                assert found[key] == pytest.approx(value, rel=1e-6 if device == "cpu" else 1e-2, abs=1e-6), key
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-def test_a_gpu_repeats_a_recorded_environment():
-    """The repeated steps equal the plain ones of the same actions."""
-    env, observation = late_state(steps=2, num_envs=16, device="cuda", masks=MASKS)
-    twin = PickPlaceEnv(num_envs=16, device="cuda", masks=MASKS)
-    twin.load_state_dict(env.state_dict())
-
-    def advance(entries):
-        after = twin._step(TensorDict(entries, [16]))
-        start = twin._reset(TensorDict({"_reset": after["done"]}, [16]))
-        return {"after": dict(after.items()), "start": dict(start.items())}
-
-    step, planner = Recorded(advance, "the environment"), RandomFeasible(env.cell)
+@pytest.mark.parametrize("settings", [{}, {"bin_items": 2, "preview": 1, "rotations": 2}])
+def test_a_repeated_environment_equals_a_plain_one(settings, device):
+    """With the same actions. What it returned stays as it was."""
+    cfg = composed("curriculum=none")
+    curriculum = build("curriculum", cfg.curriculum)
+    make = partial(PickPlaceEnv, device=device, masks=MASKS, tote_size=(6, 6, 3), **settings)
+    curriculum.setup(make(num_envs=1).cell, make(num_envs=1).items, 1_000)
+    plain, repeated = (training_env(make, curriculum, Compile(cudagraphs=flag), 0, 8) for flag in (False, True))
+    planner, state, other = RandomFeasible(plain.base_env.cell), plain.reset(), repeated.reset()
+    steps = []
     for _ in range(20):
-        action = planner.decide(observation)
-        after = env._step(TensorDict({"action": action}, [16]))
-        observation = env._reset(TensorDict({"_reset": after["done"]}, [16]))
-        result = step({"action": action})
-        assert_equal(TensorDict(result["after"], [16]), after)
-        assert_equal(TensorDict(result["start"], [16]), observation)
+        action = planner.decide(state)
+        after, state = plain.step_and_maybe_reset(state.set("action", action))
+        found, other = repeated.step_and_maybe_reset(other.set("action", action))
+        steps.append((after["next"], found["next"], state.exclude("action"), other.exclude("action")))
+    for after, found, following, next_one in steps:
+        assert_equal(found, after)
+        assert_equal(next_one, following)

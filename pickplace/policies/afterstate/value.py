@@ -93,7 +93,8 @@ class ToteValue(nn.Module, ABC):
         """
         if not self.mirrored:
             return maps
-        draws, (wide, deep) = torch.rand(3, device=maps[0].device) < 0.5, maps[0].shape[1:]
+        wide, deep = maps[0].shape[1:]
+        draws = torch.rand(3, device=maps[0].device if is_recording() else None) < 0.5
         if is_recording():  # all views, of which the device selects one; a transposed map must have the same shape
             views: list[tuple[list[int], bool]] = [([1], False), ([2], False), ([], True)]
             for (axes, turned), drawn in zip(views, draws.roll(-1), strict=True):
