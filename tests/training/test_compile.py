@@ -235,8 +235,8 @@ def test_a_repeated_environment_equals_a_plain_one(settings, device):
     plain, repeated = (training_env(make, curriculum, Compile(cudagraphs=flag), 0, 8) for flag in (False, True))
     planner, state, other = RandomFeasible(plain.base_env.cell), plain.reset(), repeated.reset()
     steps = []
-    for _ in range(20):
-        action = planner.decide(state)
+    for number in range(20):
+        action = planner.decide(state) // (1 + number % 2)  # some of the changed ones fail
         after, state = plain.step_and_maybe_reset(state.set("action", action))
         found, other = repeated.step_and_maybe_reset(other.set("action", action))
         steps.append((after["next"], found["next"], state.exclude("action"), other.exclude("action")))
