@@ -13,10 +13,10 @@ HEAD = """# Performance
 - **Environment.** 256 parallel environments make {steps:,} steps/s on one core.
 - **Decision.** A policy decides in {decision:.0f} ms on one core.
 
-`make bench` measures the tables on an idle machine, and writes this page. Settings are those of `env=paper`, except in
-the answers to a robot. Times are medians, with the 10th to 90th percentile in brackets.{gpu}
+`make bench` measures the tables on an idle machine, and writes this page. All but the answers to a robot were
+measured with the stability rule of `env=paper`. Times are medians, with the 10th to 90th percentile in brackets.{gpu}
 """
-NO_GPU = " Nothing was measured on a GPU: `python benchmarks/gpu.py` does it there, and adds a section."
+NO_GPU = " Nothing was measured on a GPU. `python benchmarks/gpu.py` measures one, and adds a section."
 
 
 def time(figures: dict) -> str:
@@ -49,9 +49,9 @@ def learning(result: dict) -> str:
         rows.append([run["seed"], *cells, f"{occupancy:.3f}", f"{seconds:.0f} s, {frames:,} frames"])
     return section(
         "Time until the tote is packed well",
-        "`experiment=quick` at 6x6x5, R=4, on all cores. Times count from the start of the process. A validation of "
-        "128 episodes follows every 50,000 frames, so no earlier time can appear. Seed 0 trains to the end; the "
-        f"others stop at {marks[-1]}.",
+        "`experiment=quick` at 6x6x5, R=4, on all cores. Times count from the start of the process. "
+        "Validations (128 episodes) come every 50,000 frames: the first is the earliest possible time. Seed 0 "
+        f"trains to the end; the others stop at {marks[-1]}.",
         table(f"seed | {' | '.join(f'until {mark}' for mark in marks)} | occupancy at the end | end", rows),
     )
 
@@ -64,7 +64,7 @@ def training(result: dict) -> str:
     parts = " | ".join(next(iter(result["trainings"].values()))["share"])
     return section(
         "Parts of the training time",
-        "The share of a batch's time that each part takes, in the median batch, on all cores.",
+        "Frames/s of the median batch, and each part's share of the whole training; on all cores.",
         table(f"`experiment=` | frames/s | {parts}", rows),
     )
 
@@ -92,7 +92,7 @@ def environment(result: dict) -> str:
     return section(
         "Environment",
         "A call of `step_and_maybe_reset` at the paper's sizes, with the mask over all 3,600 actions. The peer is "
-        f"{result['peer'] or 'not installed'} with `BinPack-v2`, compiled by JAX. It has another task, so the ratio "
+        f"{result['peer'] or 'not installed'} with `BinPack-v2`, compiled by JAX. It has another task: the ratio "
         "compares only the cost of a step.",
         table("batch | ms | steps/s | peer, ms | peer, steps/s | ratio", rows),
     )
@@ -170,7 +170,7 @@ def main() -> None:
         "seconds": max(reached, default=0),
         "good": len(reached),
         "seeds": len(seeds),
-        "steps": batch["pickplace"]["steps_per_second"] // 1000 * 1000,
+        "steps": round(batch["pickplace"]["steps_per_second"], -3),
         "gpu": "" if "gpu" in results else NO_GPU,
         "decision": next(iter(results["decision"]["rows"].values()))["6x6x5"]["ms"],
     }
