@@ -309,7 +309,11 @@ def _least_clearance(cell: CellSpec, maps: PlacingMaps, parity: int, grasped: Te
     least = []
     for turn in range(parity, len(grasped), 2):
         clear, kinds = surround(maps.clearance_in(turn), margins, FAR), grasped[turn].flip(0, 1)  # in windows' order
-        if count > 3 and torch.equal(kinds, (in_x := kinds.any(1))[:, None] & (in_y := kinds.any(0))):
+        if (
+            count > 3
+            and not is_recording()
+            and torch.equal(kinds, (in_x := kinds.any(1))[:, None] & (in_y := kinds.any(0)))
+        ):
             # Mostly, the offsets are all pairs of an x and a y of two sets. Then reduce along x, then along y.
             near, far = _far_unless(in_x), _far_unless(in_y)
             along = reduce(torch.minimum, (torch.maximum(clear[i : i + tote_w], near[i]) for i in range(count)))
@@ -337,7 +341,9 @@ def _reached_within_limits(
         clear = surround(maps.clearance_in(rotation), margins, FAR)
         highest = surround(greatest_top[:, rotation].permute(1, 2, 0), margins, NEVER)
         kinds = grasped[rotation].flip(0, 1)  # in windows' order
-        for i, j in kinds.flatten(2).any(2).nonzero().tolist():  # few for an item in metres: the whole cup lies on it
+        count = len(kinds)
+        used = product(range(count), repeat=2) if is_recording() else kinds.flatten(2).any(2).nonzero().tolist()
+        for i, j in used:  # few for an item in metres: the whole cup lies on it
             here = slice(i, i + tote_w), slice(j, j + tote_d)
             reached |= (top >= clear[here]) & (top <= highest[here]) & kinds[i, j]
     return reached

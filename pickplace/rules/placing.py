@@ -197,4 +197,5 @@ def over_tote(cell: CellSpec, surface: Tensor, rim: Tensor) -> Over:
         return over
     turns, limits = [turn % len(cell.effectors) for turn in range(cell.rotations)], cell.limits.on(device)
     bounds = limits.lowest_top[..., None], limits.highest_top[..., None]
-    return Over(over.leaves[turns], over.rim, obstacle[turns], *bounds)
+    leaves, obstacle = (torch.stack([part[turn] for turn in turns]) for part in (over.leaves, obstacle))
+    return Over(leaves, over.rim, obstacle, *bounds)

@@ -16,6 +16,7 @@ from pickplace.common.recording import recording
 from pickplace.config.registry import build
 from pickplace.planners.heuristics import RandomFeasible
 from pickplace.policies.afterstate.cells import CellsValue
+from pickplace.rules.reach.annulus import Annulus
 from pickplace.runs.loggers import read_csv
 from pickplace.training.train import train
 from pickplace.training.trainer import Trainer, training_env
@@ -35,7 +36,18 @@ def assert_equal(found: TensorDict, expected: TensorDict):
         assert torch.equal(found[key], value), key
 
 
-@pytest.mark.parametrize("settings", [*SETTINGS, {"num_envs": 4, "handling": True, "bin_items": 2, "preview": 1}])
+#: An arm that does not reach every place.
+REACH = Annulus([4.6, 9.7], [0, 10], [-9, -2.5, 0], [4, -3, 0])
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        *SETTINGS,
+        {"num_envs": 4, "handling": True, "bin_items": 2, "preview": 1},
+        {"num_envs": 4, "reach": REACH, "tote_size": (6, 6, 4)},
+    ],
+)
 def test_a_recorded_environment_does_the_same(settings):
     """Through full and partial resets, successes and failures; an observation stays as it was handed out."""
     plain, other = (PickPlaceEnv(**settings, masks=MASKS, seed=3) for _ in range(2))

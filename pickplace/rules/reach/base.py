@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pickplace.common.recording import constant_on
 from pickplace.rules.checks import is_within_reach
 from pickplace.rules.maps import FAR, NEVER
 
@@ -72,7 +73,8 @@ class Limits(Reach):
 
     def on(self, device) -> "Limits":
         """Return the tables on a device."""
-        return replace(self, **{name: table.to(device) for name, table in vars(self).items() if table is not None})
+        tables = {name: table for name, table in vars(self).items() if table is not None}
+        return replace(self, **{name: constant_on(table, torch.device(device)) for name, table in tables.items()})
 
     def allow_pick(self, pick: Tensor, face: Tensor) -> Tensor:
         """Return whether the suction face may be at a height over pick cells; flat indices and heights broadcast."""
