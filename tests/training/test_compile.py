@@ -1,10 +1,12 @@
 """Recorded work: it does what the plain work does, with fixed shapes, and never looks at a result on the way."""
 
+import shutil
 from functools import partial
 
+import commands
 import pytest
 import torch
-from commands import TINY, composed
+from commands import TINY, after_batch, assert_same, composed
 from emulated_graphs import Graph, emulate
 from problems import SETTINGS
 from tensordict import TensorDict
@@ -18,7 +20,7 @@ from pickplace.planners.heuristics import RandomFeasible
 from pickplace.policies.afterstate.cells import CellsValue
 from pickplace.rules.reach.annulus import Annulus
 from pickplace.runs.loggers import read_csv
-from pickplace.training.train import train
+from pickplace.training.train import resume_run, train
 from pickplace.training.trainer import Trainer, training_env
 
 MASKS = ("action", "footprint", "corner")
@@ -194,6 +196,15 @@ def test_a_recorded_collector_returns_the_same_entries(collector, tmp_path):
     assert sorted(found.keys(True, True), key=str) == sorted(plain.keys(True, True), key=str)
     assert found.shape == plain.shape
     assert set(found["tote_height"].flatten().tolist()) == {1}
+
+
+def test_a_recorded_training_that_is_killed_and_resumed_equals_one_that_is_not(tmp_path, no_report):
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    whole.mkdir()
+    with after_batch(5, lambda _: shutil.copytree(whole, killed)):
+        train(composed(*commands.SETTINGS, "compile=cudagraphs"), whole)
+    resume_run([f"resume={killed}"])
+    assert_same(whole, killed)
 
 
 def test_items_that_are_made_on_the_cpu_are_refused(tmp_path):
