@@ -232,7 +232,7 @@ def test_how_an_episode_ends(length, failure, reward):
 @pytest.mark.parametrize("kept", [0, 5000, 2**26])
 @pytest.mark.parametrize("masks", [("action",), ("footprint", "action"), ()])
 def test_masks_of_empty_totes_are_kept_and_are_the_same(kept, masks, monkeypatch):
-    monkeypatch.setattr("pickplace.envs.torchrl.CACHE_BYTES", kept)
+    monkeypatch.setattr("pickplace.envs.masks.CACHE_BYTES", kept)
     env = make_env([(1, 1, 1), (2, 1, 2), (1, 3, 1)], tote_size=(4, 4, 4), num_envs=12, masks=masks)
     cell, generator = env.cell, torch.Generator().manual_seed(0)
     size = cell.num_actions * ("action" in masks) + cell.num_footprints * ("action" not in masks or len(masks) == 2)
@@ -243,4 +243,4 @@ def test_masks_of_empty_totes_are_kept_and_are_the_same(kept, masks, monkeypatch
         expected = {"action": action_mask(cell, maps), "footprint": footprint_mask(cell, maps).flatten(1)}
         assert torch.equal(env.feasible, expected["footprint"].any(1))
         assert all(torch.equal(td[f"{name}_mask"], expected[name]) for name in masks)
-        assert len(env._starts) * size <= kept + 12 * size
+        assert len(env._make_masks._starts) * size <= kept + 12 * size
