@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from pickplace.rules.cell import CellSpec
-from pickplace.rules.masks import PlacingMaps, action_mask, choice_mask, corner_mask, placing_maps
+from pickplace.rules.corners import corner_mask
+from pickplace.rules.masks import PlacingMaps, action_mask, choice_mask, placing_maps
 from pickplace.rules.state import State
 
 CACHE_BYTES = 64 * 2**20  # of masks kept for the beginnings of episodes

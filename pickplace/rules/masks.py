@@ -33,6 +33,7 @@ from pickplace.rules.grasps import (
     split_footprint,
     turned_size,
 )
+from pickplace.rules.gripper.base import EffectorShape
 from pickplace.rules.item import Item, flags_from_turns
 from pickplace.rules.maps import FAR, NEVER, surround, windows
 from pickplace.rules.placing import over_tote, resting_top
@@ -185,7 +186,7 @@ def action_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
     # The flags of all rotations are packed into one number, so that a pick cell's whole block is copied at once. The
     # last of the blocks [N * K + 1, places] is empty, for picks that fail.
     packed, slots = {1: (torch.uint8, 1), 2: (torch.int16, 2)}.get(rotations, (torch.int32, 4))
-    flags = _packed_flags(packed, slots)
+    flags = torch.eye(slots, dtype=torch.uint8).view(packed).flatten().tolist()
     count, first = len(available), torch.arange(batch, device=by_class.device)
     blocks = by_class.new_zeros(batch * count + 1, places, dtype=packed)
     for bit, turned in zip(flags, classes, strict=False):
@@ -233,63 +234,11 @@ def choice_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
     return maps.join(footprint_mask(cell, maps))
 
 
-def corner_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
-    """Return a mask of the feasible footprints in corners, bool ``[N, Q, W_T, D_T]``; not empty if any is feasible.
-
-    A footprint occupies a corner if the item there is blocked in at least one direction along x and one along y. A
-    direction is blocked if one step further would raise the item, take it out of the tote, or make the end effector hit
-    something. On a fine grid, some dozens of the hundreds of feasible footprints do. Among them are the
-    bottom-left-stable ones, which are blocked in both directions to the tote's first corner (for both terms see Zhao,
-    Bennell, Bektas and Dowsland 2016, "A comparative review of 3D container loading algorithms").
-
-    If no feasible footprint occupies a corner, a direction is also blocked if one step further is infeasible. Then one
-    exists: any feasible item slides on until it is blocked.
-
-    Args:
-        cell: the sizes.
-        maps: what decides which actions succeed.
-    """
-    feasible = footprint_mask(cell, maps)
-    top = maps.rest + maps.item.h.to(maps.rest.dtype).view(-1, 1, 1, 1)
-    mask = feasible & _in_corner(maps, footprint_mask(cell, maps._replace(top=top)))
-    bare = feasible.flatten(1).any(1) & ~mask.flatten(1).any(1)
-    if is_recording() or bare.any():  # rarely
-        mask = torch.where(bare.view(-1, 1, 1, 1), feasible & _in_corner(maps, feasible), mask)
-    return mask
-
-
-def _in_corner(maps: PlacingMaps, free: Tensor) -> Tensor:
-    """Return a mask of footprints that are blocked along x and y: the next one is not free, or raises the item."""
-    rest, level = maps.rest, maps.rest + maps.level_step
-    before_x, after_x, before_y, after_y = (
-        (_neighbours(rest, axis, step, FAR) > level) | ~_neighbours(free, axis, step, False)
-        for axis in (2, 3)
-        for step in (-1, 1)
-    )
-    return (before_x | after_x) & (before_y | after_y)
-
-
-def _neighbours(maps: Tensor, axis: int, step: int, beyond) -> Tensor:
-    """Return the value of each footprint's neighbour, a step further along an axis; ``beyond`` outside the grid."""
-    moved = maps.roll(-step, axis)
-    moved.select(axis, -1 if step > 0 else 0).fill_(beyond)
-    return moved
-
-
-@lru_cache(maxsize=8)
-def _packed_flags(packed: torch.dtype, slots: int) -> list[int]:
-    """Return the number that holds a true flag in each of the slots alone."""
-    return torch.eye(slots, dtype=torch.uint8).view(packed).flatten().tolist()
-
-
-def _reference_cells(cell: CellSpec, device) -> Tensor:
-    shapes = map(cell.effector, range(cell.rotations))
-    return _points(tuple((shape.ref_x, shape.ref_y) for shape in shapes), device)  # [R, 2]
-
-
 @lru_cache(maxsize=64)
-def _points(points: tuple[tuple[int, int], ...], device) -> Tensor:
-    return torch.tensor(points, device=device)
+def _reference_cells(shapes: tuple[EffectorShape, ...], rotations: int, device: torch.device) -> Tensor:
+    """Return the reference cells of the turned end effector, int64 ``[R, 2]``."""
+    turned = (shapes[rotation % len(shapes)] for rotation in range(rotations))
+    return torch.tensor([(shape.ref_x, shape.ref_y) for shape in turned], device=device)
 
 
 def _footprint_margins(cell: CellSpec, parity: int) -> tuple[int, int, int, int]:
@@ -362,7 +311,10 @@ def actions_reaching(cell: CellSpec, maps: PlacingMaps, footprint: Tensor) -> Te
     (tote_w, tote_d, _), device = cell.tote_size, footprint.device
     maps, footprint = maps.of_choice(cell, footprint)
     lifted, offset = all_grasps(cell, maps.item, maps.blocked)
-    rotation, refs = torch.arange(cell.rotations, device=device), _reference_cells(cell, device)
+    rotation, refs = (
+        torch.arange(cell.rotations, device=device),
+        _reference_cells(cell.effectors, cell.rotations, device),
+    )
     turned, x, y = split_footprint(cell.tote_size, footprint)
     place_x, place_y = (torch.stack([x, y], -1)[:, None, None] + refs - offset).unbind(-1)  # [N, P, R]
     in_tote = ~is_outside(place_x, 1, tote_w) & ~is_outside(place_y, 1, tote_d)
@@ -403,7 +355,9 @@ def action_footprints(cell: CellSpec, items: Item, blocked: Tensor | None = None
     lifted, offset = all_grasps(cell, item, blocked_picks(cell, items) if blocked is None else blocked)
     check_actions(cell, len(lifted), device)
     turned = torch.arange(cell.rotations, device=device) % 2  # [R]
-    corner = (offset - _reference_cells(cell, device))[:, :, None, None]  # [N * M, P, 1, 1, R, 2]
+    corner = (offset - _reference_cells(cell.effectors, cell.rotations, device))[
+        :, :, None, None
+    ]  # [N * M, P, 1, 1, R, 2]
     x = corner[..., 0] + torch.arange(tote_w, device=device)[:, None, None]
     y = corner[..., 1] + torch.arange(tote_d, device=device)[:, None]
     w, d = (size[:, None, None, None] for size in turned_size(item.rows((slice(None), None)), turned == 1))

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from problems import problems, state_of
 
 from pickplace import CellSpec, Item, State
-from pickplace.rules.masks import corner_mask, footprint_mask, placing_maps
+from pickplace.rules.corners import corner_mask
+from pickplace.rules.masks import footprint_mask, placing_maps
 from pickplace.rules.reach.base import Limits
 from pickplace.rules.state import surface_from
 

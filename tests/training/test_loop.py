@@ -15,6 +15,7 @@ from pickplace import CellSpec, PickPlaceEnv
 from pickplace.algorithms.actor_critic import ActorCritic
 from pickplace.algorithms.base import At
 from pickplace.algorithms.imitation import Imitation, imitation_loss
+from pickplace.common.graphs import PLAIN
 from pickplace.config.registry import build
 from pickplace.evaluation.play import play
 from pickplace.planners.heuristics import JointDBL
@@ -217,7 +218,7 @@ def test_the_slots_of_all_workers_share_the_episodes_of_a_stream():
     curriculum.setup(CellSpec(tote_size=(4, 4, 2)), build("items", cfg["items"]), 100)
     base_env = partial(PickPlaceEnv, tote_size=(4, 4, 2), items=build("items", cfg["items"]), episode_stride=4)
     for first in (0, 2):
-        env = training_env(base_env, curriculum, first_episode=first, num_envs=2)
+        env = training_env(base_env, curriculum, PLAIN, first_episode=first, num_envs=2)
         env.set_seed(0)
         for _ in range(3):
             env.reset()
