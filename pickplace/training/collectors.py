@@ -1,4 +1,4 @@
-"""Collectors whose state is saved and restored exactly. The only module that uses private names of TorchRL."""
+"""Collectors whose state is saved and restored exactly. Only they and the loss of PPO use private names of TorchRL."""
 
 import signal
 import sys
