@@ -161,13 +161,18 @@ TRAININGS = {
 }
 
 
+#: The other trainings differ from these in a few lines only.
+OFTEN = ("ppo", "sampled_ppo", "td", "a warm start")
+NAMES = [pytest.param(name, marks=[] if name in OFTEN else pytest.mark.slow) for name in TRAININGS]
+
+
 def words(name: str) -> list[str]:
     tiny = ONE_NETWORK if name.startswith("td") else TINY
     size = "env.tote_size=[6,6,3]"  # for the receptive field of fcn4d
     return [*TRAININGS[name][0], *tiny, size, "total_frames=64", "curriculum=none", "evaluation_interval=64"]
 
 
-@pytest.mark.parametrize("name", TRAININGS)
+@pytest.mark.parametrize("name", NAMES)
 def test_a_training_learns_the_same_recorded(name, tmp_path, no_report):
     """The first batch has the same metrics up to rounding, after which draws may differ; values draw the same."""
     rows = {}
@@ -228,7 +233,7 @@ def device(request, monkeypatch):
     return "cpu"
 
 
-@pytest.mark.parametrize("name", TRAININGS)
+@pytest.mark.parametrize("name", NAMES)
 def test_a_repeated_training_equals_one_that_runs_each_time(name, device, tmp_path, monkeypatch, no_report):
     """Through validations, another size of the last minibatch, and new heights of the tote."""
     rows = {}
