@@ -20,25 +20,23 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # JAX leaves memory for torch
+import torch
+from common import console_command, save
+from environment import Jumanji
+from hydra import compose, initialize_config_dir
+from tensordict import TensorDict
 
-import torch  # noqa: E402
-from common import console_command, save  # noqa: E402
-from environment import Jumanji  # noqa: E402
-from hydra import compose, initialize_config_dir  # noqa: E402
-from tensordict import TensorDict  # noqa: E402
-
-from pickplace.common.graphs import Compile  # noqa: E402
-from pickplace.config.composition import conf_dir  # noqa: E402
-from pickplace.planners.heuristics import RandomFeasible  # noqa: E402
-from pickplace.training.trainer import Trainer, training_env  # noqa: E402
+from pickplace.common.graphs import Compile
+from pickplace.config.composition import conf_dir
+from pickplace.planners.heuristics import RandomFeasible
+from pickplace.training.trainer import Trainer, training_env
 
 MARK = 0.975
 COMPILED = {"plain": "none", "recorded": "cudagraphs"}
 
 
 class Sizes(NamedTuple):
-    """What is measured: numbers of problems, words of the trainings, batches of each, words of the timed training."""
+    """Parallel problems of the environment; trainings with their overrides, and batches of each; the timed training."""
 
     problems: tuple[int, ...]
     trainings: dict[str, list[str]]
@@ -124,6 +122,7 @@ def measure_environment(problems: int, device: str, compile: Compile, steps: int
 
 def measure_peer(problems: int, steps: int = 30) -> dict | None:
     """Return the time of a step of Jumanji's environment, or None without it."""
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # JAX then leaves memory for torch
     try:
         world = Jumanji(problems)
     except ImportError:

@@ -86,7 +86,7 @@ class EmulatedTorch:
         self.cuda = SimpleNamespace(
             is_available=lambda: True, Stream=lambda device=None: stream, current_stream=lambda device=None: stream,
             stream=lambda each: nullcontext(), synchronize=lambda device=None: None, CUDAGraph=Graph,
-            graph=lambda graph, stream=None: Capture(graph), set_device=lambda device: None,
+            graph=lambda graph, stream=None: Capture(graph),
         )  # fmt: skip
 
     def __getattr__(self, name):

@@ -112,7 +112,7 @@ class MinibatchDescent(Algorithm):
         return {f"train/{name}": total / len(history) for name, total in sums.items()} | {"train/lr": rate}
 
     def _compiled_step(self, objective: Objective) -> Callable[[TensorDictBase], dict[str, Tensor]]:
-        """Return the gradient step for an objective, of which a minibatch ``[B]`` is the input."""
+        """Return the function that makes a gradient step on a minibatch ``[B]`` for an objective."""
         if self.task.compile == PLAIN:
             return partial(self._step, objective)
         if objective not in self._steps:

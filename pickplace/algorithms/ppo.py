@@ -36,6 +36,9 @@ class ClippedLoss(ClipPPOLoss):
     """TorchRL's loss, of distributions that know their entropy."""
 
     def _get_entropy(self, dist: Distribution, adv_shape) -> Tensor:
-        """Return the entropy. TorchRL also asks in each step whether it is finite, for which a GPU must wait; the
-        gradient step checks the whole loss."""
+        """Return the entropy.
+
+        TorchRL also checks in each step that it is finite, and a GPU must wait for that. Here the gradient step checks
+        the whole loss.
+        """
         return dist.entropy()[..., None]

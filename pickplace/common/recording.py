@@ -1,6 +1,7 @@
 """Recording of GPU work: a CUDA graph repeats the same work, so that its shapes and its course must not depend on data.
 
-Code that could save work by looking at results, such as skipping rows that did not change, asks :func:`is_recording`.
+Code that skips work where there is none to do asks :func:`any_of`. Code with another way for a recording asks
+:func:`is_recording`.
 """
 
 from collections.abc import Iterator
@@ -28,6 +29,11 @@ def recording() -> Iterator[None]:
 def is_recording() -> bool:
     """Return whether shapes must be fixed, and nothing may be read back from the device."""
     return _RECORDING.get()
+
+
+def any_of(mask: Tensor) -> bool:
+    """Return whether any of a mask is true; always true in a recording, which cannot look."""
+    return is_recording() or bool(mask.any())
 
 
 def constant_on(constant: Tensor, device: torch.device) -> Tensor:

@@ -10,7 +10,7 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from pickplace.common.machine import usable_device
-from pickplace.common.recording import is_recording
+from pickplace.common.recording import any_of, is_recording
 from pickplace.common.validate import check_bytes, expect, one_of, or_null, refuse_if, whole_number
 from pickplace.envs.checks import check_items, check_numbers, most_items, problem_bytes, require
 from pickplace.envs.episode import RESET_ENTRIES, SETTINGS
@@ -236,7 +236,7 @@ class PickPlaceEnv(EnvBase):
         self._refill(rows, self.state.items)
         self._update_masks(rows, empty=True)
         jammed = rows & ~self.feasible  # the first item alone always has a feasible action
-        if self.cell.bin_items > self.cell.poses and (is_recording() or jammed.any()):
+        if self.cell.bin_items > self.cell.poses and any_of(jammed):
             self.item[:, self.cell.poses :] *= ~jammed[:, None, None]
             self.arrived.masked_fill_(jammed, 1)
             self._look_ahead()

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from pickplace.common.recording import is_recording
+from pickplace.common.recording import any_of
 from pickplace.items.distributions import ItemDistribution, hashed_uniform
 from pickplace.items.tipping import in_pose
 from pickplace.rules.bin import add_item, find_room, is_below_limit, may_arrive, must_share
@@ -35,7 +35,7 @@ def refill(
     open_ = rows & may_arrive(cell, items, differs)
     for number in range(0, items.x.shape[1], cell.poses):
         open_ = open_ & is_below_limit(items, differs)
-        if number and not is_recording() and not open_.any():
+        if number and not any_of(open_):
             break
         item, before = next_item(cell, source, stream, seed, episode, arrived, differs), items
         for pose in range(cell.poses):

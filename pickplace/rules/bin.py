@@ -10,7 +10,7 @@ from functools import reduce
 import torch
 from torch import Tensor
 
-from pickplace.common.recording import is_recording
+from pickplace.common.recording import any_of
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import split_action
 from pickplace.rules.item import Item
@@ -109,7 +109,7 @@ def remove_item(cell: CellSpec, items: Item, number: Tensor, removed: Tensor | N
 
 def must_share(items: Item, rows: Tensor) -> bool:
     """Return whether any of the bins in ``rows``, bool ``[N]``, already holds an item, or may. All must have room."""
-    return items.x.shape[1] > 1 and (is_recording() or bool((rows & items.exists[:, 0]).any()))
+    return items.x.shape[1] > 1 and any_of(rows & items.exists[:, 0])
 
 
 def add_item(items: Item, item: Item, rows: Tensor) -> Item:
@@ -193,7 +193,7 @@ def let_in(cell: CellSpec, state: State) -> State:
         if must_share(items, open_):
             item = find_room(cell, item, items, ~items.exists[:, 0], first.double())
         open_ = open_ & item.exists
-        if not is_recording() and not open_.any():
+        if not any_of(open_):
             break
         items, coming = add_item(items, item, open_), remove_item(cell, coming, first, open_)
     return state._replace(items=items, coming=coming)

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from pickplace.common.recording import is_recording
+from pickplace.common.recording import any_of
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.maps import FAR
 from pickplace.rules.masks import PlacingMaps, footprint_mask
@@ -29,7 +29,7 @@ def corner_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
     top = maps.rest + maps.item.h.to(maps.rest.dtype).view(-1, 1, 1, 1)
     mask = feasible & _in_corner(maps, footprint_mask(cell, maps._replace(top=top)))
     bare = feasible.flatten(1).any(1) & ~mask.flatten(1).any(1)
-    if is_recording() or bare.any():  # rarely
+    if any_of(bare):  # rarely
         mask = torch.where(bare.view(-1, 1, 1, 1), feasible & _in_corner(maps, feasible), mask)
     return mask
 

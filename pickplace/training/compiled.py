@@ -54,7 +54,7 @@ class RecordedEnv(TransformedEnv):
     def reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
         state = super().reset(tensordict, **kwargs)
         # Copies: recorded work writes into the environment's own masks.
-        return state.update({key: state[key].clone() for key in state.keys() if key.endswith("_mask")})  # noqa: SIM118
+        return state.update({key: value.clone() for key, value in state.items() if key.endswith("_mask")})
 
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         settings = self.transform[0].draw(self.batch_size)

@@ -95,7 +95,7 @@ class ToteValue(nn.Module, ABC):
             return maps
         wide, deep = maps[0].shape[1:]
         draws = torch.rand(3, device=maps[0].device if is_recording() else None) < 0.5
-        if is_recording():  # all views, of which the device selects one; a transposed map must have the same shape
+        if is_recording():  # the device selects among all views, which must have one shape
             views: list[tuple[list[int], bool]] = [([1], False), ([2], False), ([], True)]
             for (axes, turned), drawn in zip(views, draws.roll(-1), strict=True):
                 if not turned or (wide == deep and self.may_turn(wide, deep)):
