@@ -20,10 +20,12 @@ FAULTS = """
 import resource, torch
 from pickplace.common.machine import keep_memory
 keep_memory()
-for _ in range(3):
+faults = []
+for _ in range(20):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
     torch.ones(2**26, dtype=torch.uint8)
-print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+    faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+print(max(faults[10:]))
 """
 
 
@@ -57,6 +59,9 @@ def test_quota_limits_the_default_only(threads, monkeypatch):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="of glibc")
 def test_memory_that_was_freed_is_used_again():
-    """It has 16,384 pages of 4 KiB; each would be a page fault if it had been returned."""
+    """It has 16,384 pages of 4 KiB; each would be a page fault if it had been returned.
+
+    The first tensors may lie in different places, so some of them fault although memory is kept.
+    """
     out = subprocess.run([sys.executable, "-c", FAULTS], capture_output=True, text=True, check=True)
     assert int(out.stdout) < 1_000
