@@ -12,7 +12,7 @@ from pickplace.serve.decisions import DecisionLog, what_is_served
 from pickplace.serve.options import load_planner, plan_once, planner_options
 
 TOKEN = "PICKPLACE_TOKEN"  # an environment variable, as every user of the machine can read a command line
-LEAST_TOKEN = 16  # fewest letters
+LEAST_TOKEN = 16  # fewest characters
 
 
 @one_sentence()
@@ -127,6 +127,6 @@ def checked_token(host: str) -> str | None:
     refuse_if(
         token is not None
         and (len(token) < LEAST_TOKEN or not token.isascii() or not token.isprintable() or " " in token),
-        f"{TOKEN}: got {len(token or '')} letters; expected at least {LEAST_TOKEN}, of ASCII without spaces.",
+        f"{TOKEN}: got {len(token or '')} characters; expected at least {LEAST_TOKEN}, printable ASCII without spaces.",
     )
     return token
