@@ -99,6 +99,7 @@ def test_own_planner_draws_by_its_seed(monkeypatch):
         assert torch.equal(action, same.decide(observation)) and not torch.equal(action, other.decide(observation))
 
 
+@pytest.mark.slow
 def test_own_planner_teaches(example, tmp_path):
     """A training that is resumed while it imitates draws the same numbers as an uninterrupted one."""
     imitate = ["warm_start=imitate", "planner@warm_start.teacher=soft_dbl", "warm_start.teacher.temperature=1"]

@@ -323,6 +323,7 @@ def test_hydra_s_flags_with_its_debugging_output(run, tmp_path, name, words):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_hydra_s_debugging_output_of_a_run(run, monkeypatch):
     given = []
     monkeypatch.setattr(train, "train", lambda cfg, run_dir: given.append((cfg.seed, run_dir.name)))

@@ -313,6 +313,7 @@ class Clumsy:
             yield Outcome(plan.episode, "slipped", 1, 1, 1, volume)
 
 
+@pytest.mark.slow
 def test_a_physics_engine_of_ones_own(command, evaluation):
     """One class; it needs no MuJoCo, and its config may be a file."""
     words = [*SMALL[:2], "planner=joint_dbl", "evaluation.episodes=3", "evaluation.plans=true", "evaluation.replay=2"]

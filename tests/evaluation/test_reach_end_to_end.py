@@ -73,6 +73,7 @@ def test_a_checkpoint_brings_its_reach(begun, evaluation, run, tmp_path):
     assert "env.reach.radi:" in evaluation(f"checkpoint={begun}", "env.reach.radi=[1,2]")
 
 
+@pytest.mark.slow
 def test_shipped_weights_are_evaluated_with_a_reach_and_another_gripper(evaluation):
     words = ["checkpoint=pretrained/r4", "env.tote_size=[6,6,1]"]
     plain = evaluation(*words)

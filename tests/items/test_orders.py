@@ -83,7 +83,7 @@ def test_a_file_is_read_in_any_unit(tmp_path_factory, orders, unit, weight):
         assert [[pytest.approx(item, abs=1e-6) for item in order] for order in orders] == found
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(ORDERS, st.sampled_from([(0.02, 1.0), (0.03, 0.25)]))
 def test_streams_share_no_order_and_play_each_once(tmp_path_factory, orders, sizes):
     cell, unit = sizes

@@ -109,7 +109,7 @@ class Slots:
         return State.from_observation(observation), action, after
 
 
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(
     st.sampled_from([*SOURCES]), st.sampled_from([1, 3]), st.sampled_from(REFILLS), st.integers(1, 7),
     st.integers(0, 999),
@@ -141,7 +141,7 @@ def test_what_is_seen_is_what_arrives(source, bin_items, refill, preview, seed):
     assert seen or slots.varies
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(st.sampled_from(["kinds", "uniform", "handling", "mixes", "cut", "orders", "recorded"]),
        st.sampled_from([1, 3]), st.sampled_from(REFILLS), st.integers(0, 999))  # fmt: skip
 def test_the_state_after_a_placement_is_known(source, bin_items, refill, seed):

@@ -110,10 +110,13 @@ def test_plans_without_a_bin_are_refused():
 
 @pytest.mark.parametrize("count", [2, pytest.param(12, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("settings", [
-    {}, {"effector_size": (3, 2), "bin_size": (4, 5, 2)}, {"effector_size": (6, 5), "tote_size": (6, 6, 1)},
+    {},
+    pytest.param({"effector_size": (3, 2), "bin_size": (4, 5, 2)}, marks=pytest.mark.slow),
+    {"effector_size": (6, 5), "tote_size": (6, 6, 1)},
     {"pick_rule": "overlap", "bin_size": (5, 5, 3), "effector_size": (2, 2)},
-    {"pick_rule": "seal", "effector_size": (1, 1)},
-    {"pick_rule": "seal", "min_seal": 0.25, "cup": [[1, 0, 1], [0, 0, 0], [1, 0, 1]]},
+    pytest.param({"pick_rule": "seal", "effector_size": (1, 1)}, marks=pytest.mark.slow),
+    pytest.param({"pick_rule": "seal", "min_seal": 0.25, "cup": [[1, 0, 1], [0, 0, 0], [1, 0, 1]]},
+                 marks=pytest.mark.slow),
     {"pick_rule": "seal", "min_seal": 0.5, "body": [[1, 1, 1], [1, 0, 0]], "cup": [[1, 1, 0], [0, 0, 0]],
      "effector_size": (2, 3)},
     {"bin_items": 3, "bin_size": (6, 5, 1), "items": Uniform((1, 2), (1, 3), (1, 2))},

@@ -74,9 +74,9 @@ def totals(policy, state, depth):
 @pytest.mark.parametrize(("settings", "depth", "problems"), [
     (SEVERAL, 2, 8),
     ({**SEVERAL, "gripper": Overlap((1, 1)), "support": "full"}, 2, 8),
-    ({**SEVERAL, "tote_size": (3, 3, 3)}, 3, 1),
-    ({**CONVEYOR, "tote_size": (3, 3, 2)}, 3, 4),
-    (BOTH, 2, 4),
+    pytest.param({**SEVERAL, "tote_size": (3, 3, 3)}, 3, 1, marks=pytest.mark.slow),
+    ({**CONVEYOR, "tote_size": (3, 3, 2)}, 3, 2),
+    (BOTH, 2, 1),
 ])  # fmt: skip
 def test_a_wide_beam_finds_the_best_of_all_plans(settings, depth, problems):
     policy, decided = untrained(PickPlaceEnv(**settings).cell), 0
@@ -89,8 +89,8 @@ def test_a_wide_beam_finds_the_best_of_all_plans(settings, depth, problems):
             if choices:
                 assert expected[choices.index(decision)] == pytest.approx(max(expected), abs=1e-4)
                 decided += 1
-        if decided >= problems:
-            return
+            if decided == problems:
+                return
     raise AssertionError("too few problems")
 
 

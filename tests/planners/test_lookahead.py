@@ -151,6 +151,7 @@ def test_it_is_better_than_its_policy_and_a_critic_that_errs_does_not_make_it_wo
     assert gain_bounds(pack(search_of(env, worst, **settings)) - alone)[1] < 0
 
 
+@pytest.mark.slow
 def test_it_is_better_than_its_policy_with_several_items():
     sizes = {"tote_size": (4, 4, 2), "bin_items": 2}
     env = make_env(1, **sizes)

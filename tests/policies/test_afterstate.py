@@ -332,7 +332,8 @@ def test_the_true_value_is_where_targets_agree_with_it(lmbda, length):
 
 @pytest.mark.parametrize("model", [
     ["model=afterstate", "model.actor.grid=[3,3,1]", "model.actor.filters=16", "model.actor.hidden=32"],
-    ["model=afterstate_fcn", "model.actor.stem=16", "model.actor.filters=32", "algo.epochs=8"],
+    pytest.param(["model=afterstate_fcn", "model.actor.stem=16", "model.actor.filters=32", "algo.epochs=8"],
+                 marks=pytest.mark.slow),
 ])  # fmt: skip
 def test_it_comes_within_1_percent_of_the_optimum(model, tmp_path):
     words = ["experiment=afterstate", *model, "env.tote_size=[3,3,1]", "env.rotations=2"]

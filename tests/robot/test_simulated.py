@@ -39,7 +39,9 @@ def fill(planner: Planner, seed: int, sizes) -> float:
     return filled.volume / np.prod((0.3, 0.3, 0.25))
 
 
-@pytest.mark.parametrize(("seed", "sizes"), [(0, BOXES), (1, ANY)])
+@pytest.mark.parametrize(("seed", "sizes"), [
+    (0, BOXES), pytest.param(1, ANY, marks=pytest.mark.slow),
+])  # fmt: skip
 def test_a_gantry_fills_a_tote_by_what_cameras_see(seed, sizes):
     """``slow`` fills 20 totes."""
     assert fill(Planner.load("pretrained/mixed", **SIZES), seed, sizes) > 0.1

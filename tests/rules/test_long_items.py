@@ -92,7 +92,7 @@ def test_a_margin_is_exceeded_up_to_the_hulls_edge(case):
     assert contact.is_centre_in_hull(distance - 1e-7) and not contact.is_centre_in_hull(distance + 1e-7)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(supported())
 def test_an_item_of_any_size_bears_weight_inside_scipys_hull(case):
     size, held, equations = case

@@ -39,7 +39,7 @@ from pickplace.rules.support.contact import Contact
 from pickplace.rules.support.rules import Hull
 
 
-@settings(max_examples=150)
+@settings(max_examples=80)
 @given(problems(limited=st.booleans(), count=2, shaped=st.booleans()), st.sampled_from([1, placing.LEAST_SIDE]))
 def test_masks_equal_the_step_and_the_oracle(problem, least_side):
     cell, cases = problem

@@ -48,7 +48,7 @@ def is_inside(point: np.ndarray, parts: np.ndarray) -> bool:
     return len(corners) > 0 and bool((((corners - point) @ DIRECTIONS).max(0) > -1e-6).all())
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(
     st.integers(0, 10**6), st.tuples(st.integers(1, 3), st.integers(1, 3)), st.floats(0.3, 1), st.floats(0.3, 1),
     st.sampled_from([0.0, 0.1, 0.25]),

@@ -138,18 +138,15 @@ def test_mixes_draw_their_kinds_and_mix_0_is_the_distribution_itself():
 SEVERAL = ["env.bin_items=2", "env.bin_size=[5,5,1]", "algo.advantages=gae"]
 
 
-@pytest.mark.parametrize(
-    ("collector", "others", "words"),
-    [("single", "rotations: 2", []), ("multi_sync", "rotations: 2, bin_items: 1}, {refill: batch", SEVERAL)],
-)
-def test_a_run_over_such_levels_is_resumed_exactly(collector, others, words, tmp_path):
-    levels = f"curriculum.levels=[{{items: {{weights: [1, 0, 0, 0]}}, tote_height: 2}}, {{{others}}}, {{}}]"
-    rule = ["curriculum=learning_progress", "curriculum.advance.window=4", levels, f"collector={collector}"]
+def test_a_run_over_such_levels_is_resumed_exactly(tmp_path):
+    others = "{rotations: 2, bin_items: 1}, {refill: batch}"
+    levels = f"curriculum.levels=[{{items: {{weights: [1, 0, 0, 0]}}, tote_height: 2}}, {others}, {{}}]"
+    rule = ["curriculum=learning_progress", "curriculum.advance.window=4", levels, "collector=multi_sync"]
     usual = [word for word in SETTINGS if not word.startswith("curriculum")]
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     whole.mkdir()
     with after_batch(5, lambda _: shutil.copytree(whole, killed)):
-        train(composed(*usual, *words, *rule), whole)
+        train(composed(*usual, *SEVERAL, *rule), whole)
     resume_run([f"resume={killed}"])
     assert_same(whole, killed)
     rows = read_csv(whole / "metrics.csv")

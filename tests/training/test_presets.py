@@ -14,7 +14,13 @@ AFTERSTATE = ("afterstate", "afterstate_fcn")  # models whose network is the cri
 ONE_NETWORK = [word for word in TINY if not word.startswith("model.critic.")]
 
 
-@pytest.mark.parametrize("name", options("experiment"))
+#: Presets that differ from another one in numbers only.
+LIKE_OTHERS = ("mixed_bin3", "paper_fast_gpu", "paper_gpu")
+
+
+@pytest.mark.parametrize("name", [
+    pytest.param(name, marks=[pytest.mark.slow] * (name in LIKE_OTHERS)) for name in options("experiment")
+])  # fmt: skip
 def test_every_preset_runs(name, tmp_path, monkeypatch):
     """And ends in a report. Its figures, which are the same for all presets, take most of the time."""
     if name != "smoke":

@@ -18,6 +18,7 @@ def recording_of(boxes, size, failure=Failure.STUCK):
     return Recording(0, size[2], moves, failure)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 def test_picture_of_a_large_tote_and_of_many_kinds(tmp_path):
     small = [(3 * i, 3 * j, 3 * k, i + 1, j + 1, k + 1) for i in range(3) for j in range(3) for k in range(3)]
