@@ -17,7 +17,8 @@ from pickplace.runs.locate import PRETRAINED
 CARDS = sorted(PRETRAINED.glob(f"*/{export.CARD}"))
 EPISODES = 8
 POLICY_ALONE = ("fcn4d", "mixed", "warehouse", "gopt_rs", "cdrl_rs", "cut1", "cut2")
-LIKE_OTHERS = ("r1", "r3", "cdrl_rs", "cut2")  # the same networks as r4, gopt_rs and cut1
+#: The networks of r4, gopt_rs, cut1 and mixed with other weights, or on a finer grid.
+LIKE_OTHERS = ("r1", "r3", "cdrl_rs", "cut2", "mixed_bin3", "warehouse")
 each_card = pytest.mark.parametrize("path", CARDS, ids=lambda path: path.parent.name)
 
 
