@@ -23,7 +23,7 @@ from pickplace.views.figures import COLOURS, figure_of
 RESULTS, RUNS = ROOT / "docs" / "results" / "paper", ROOT / "outputs" / "paper"
 SMALL, LARGE = ("6x6x5", "6x6x10", "10x10x5", "10x10x10"), ("30x30x5", "30x30x10")
 CANDIDATES = (1, 2, 3, 5, 10, 20, 50)
-MANY, FEW = 100, 10  # numbers of episodes; few if a tote takes minutes
+MOST, MANY, FEW = 500, 100, 10  # numbers of episodes: where a tote takes a moment, seconds, or minutes
 
 
 class Training(NamedTuple):
@@ -70,7 +70,9 @@ class Cell(NamedTuple):
 
     @property
     def episodes(self) -> int:
-        return FEW if self.tote in LARGE or self.method == "mcts" else MANY
+        if self.tote in LARGE or self.method == "mcts":
+            return FEW
+        return MOST if self.tote == "6x6x5" else MANY
 
 
 def cells() -> Iterator[Cell]:
