@@ -53,12 +53,8 @@ def bin_maps(items: dict[int, tuple[int, ...]], sides) -> tuple[np.ndarray, np.n
     return depth, labels
 
 
-#: The tops of items and the distances from the tote's origin have about the same weight.
-WEIGHING = [{"_target_": "corner", "height_weight": 1}, {"_target_": "heightmap_minimisation", "distance_weight": 1}]
-
-
-def make_planner(name: str | dict, cell: CellSpec) -> Planner:
-    if name == "joint_dbl" or name in WEIGHING:
+def make_planner(name: str, cell: CellSpec) -> Planner:
+    if name == "joint_dbl":
         return Planner(cell, planner=name)
     torch.manual_seed(0)
     policy = untrained_policy(cell) if name == "fcn_grasp" else Fcn4d(cell, filters=4).eval()
@@ -114,7 +110,7 @@ def test_plans_agree_with_the_oracle(name, seed, most, rule, rotations):
 
 
 @settings(max_examples=30)
-@given(st.sampled_from(["joint_dbl", "fcn_grasp", *WEIGHING]), st.integers(0, 10**6))
+@given(st.sampled_from(["joint_dbl", "fcn_grasp"]), st.integers(0, 10**6))
 def test_whole_cells_in_metres_give_the_plan_of_whole_cells(name, seed):
     """There items are on grids of their own, blocked picks come from rectangles, and failures from measured maps."""
     draw, sides = np.random.default_rng(seed), (6, 6)
