@@ -55,5 +55,6 @@ def pack(robot, planner, cell_size: float) -> None:
             robot.call_for_help("an item fell")
             bearing, placed, missed = None, [], []
         else:  # impossible or rejected
-            robot.call_for_help(f"take an item out: {plan.hints or plan.reasons}")
+            item = "an item" if plan.item_number is None else f"items[{plan.item_number}]"
+            robot.call_for_help(f"take {item} out: {plan.hints or plan.reasons}")
             missed = []

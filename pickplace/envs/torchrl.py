@@ -18,7 +18,7 @@ from pickplace.envs.masks import MASKS, MaskMaker
 from pickplace.items.arrival import coming_items, refill
 from pickplace.items.distributions import MAX_SEED, PAPER_KINDS, STREAMS, ItemDistribution, Kinds, check_seed
 from pickplace.items.tipping import check_tipping, longest_side, sizes_in_bin
-from pickplace.rules.bin import remove_item
+from pickplace.rules.bin import may_arrive, remove_item
 from pickplace.rules.cell import CELL_SETTINGS, cell_from_settings
 from pickplace.rules.item import ALL_TURNS, Item
 from pickplace.rules.observation import Term, check_terms, observe
@@ -326,6 +326,7 @@ class PickPlaceEnv(EnvBase):
 
     def _refill(self, rows: Tensor, left: Item) -> Item:
         """Let items arrive in the bins in ``rows``, bool ``[N]``; ``left`` and the result are all items, ``[N, M]``."""
+        rows = rows & may_arrive(self.cell, left, self._differs)
         items, arrived = refill(self.cell, self.items, self.stream, *self._address, left, rows, self._differs)
         self.item.copy_(items.table)
         self.arrived.copy_(arrived)

@@ -6,7 +6,7 @@ from torch import Tensor
 from pickplace.common.recording import any_of
 from pickplace.items.distributions import ItemDistribution, hashed_uniform
 from pickplace.items.tipping import in_pose
-from pickplace.rules.bin import add_item, find_room, is_below_limit, may_arrive, must_share
+from pickplace.rules.bin import add_item, find_room, is_below_limit, must_share
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Item
 from pickplace.rules.state import FULL_TASK, Episode
@@ -19,20 +19,19 @@ def refill(
     """Return the bins after new items arrived, ``[N, M]``, and the number that has arrived in all, int64 ``[N]``.
 
     Items arrive in the order of the stream. In an empty bin an item lies at its own place; else at a uniformly random
-    place where it overlaps no other. An item without room waits, and so do those after it. With ``refill="batch"`` only
-    empty bins are filled. With ``cell.tipping`` an item arrives in all its poses, each at the first free place, or
-    waits.
+    place where it overlaps no other. An item without room waits, and so do those after it. With ``cell.tipping`` an
+    item arrives in all its poses, each at the first free place, or waits.
 
     Args:
-        cell: has the refill rule, unless episodes differ in it.
+        cell: the sizes and options.
         source: the item distribution.
         stream, seed, episode: see :meth:`~pickplace.items.distributions.ItemDistribution.sample`.
         arrived: int64 ``[N]``, number of items that have arrived so far.
         items: ``[N, M]``, the first ones filled.
-        rows: bool ``[N]``, the bins in which items may arrive.
+        rows: bool ``[N]``, the bins in which items may arrive, see :func:`~pickplace.rules.bin.may_arrive`.
         differs: settings in which the episodes differ.
     """
-    open_ = rows & may_arrive(cell, items, differs)
+    open_ = rows
     for number in range(0, items.x.shape[1], cell.poses):
         open_ = open_ & is_below_limit(items, differs)
         if number and not any_of(open_):

@@ -57,6 +57,9 @@ class MapPlanner(ABC):
             observation: the input of a policy, in the height units of its training.
         """
 
+    def restart(self) -> None:  # noqa: B027
+        """Begin random draws anew. A robot asks for it before each plan, so that equal scenes have equal plans."""
+
     @torch.no_grad()
     def decide(self, observation: Observation) -> Tensor:
         state = State.from_observation(observation)

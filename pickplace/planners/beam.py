@@ -9,7 +9,7 @@ from torch import Tensor
 from pickplace.common.validate import number, or_null, refuse_if, whole_number
 from pickplace.planners.base import MapPlanner
 from pickplace.policies.base import EstimatesValue, Policy, ScoresFootprints
-from pickplace.rules.bin import awaits_unseen, let_in
+from pickplace.rules.bin import let_in
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Observation
 from pickplace.rules.masks import PlacingMaps, first_action_reaching, placing_maps
@@ -27,10 +27,11 @@ class _Plans(NamedTuple):
     placed: Tensor  # int64 [P], the placed volume
     total: Tensor  # float32 [P], the scaled placed volume plus the value of the state after it
     state: State  # of P problems
+    awaits: Tensor  # bool [P], whether items that are not seen may lie in the bin, or arrive next
 
     def rows(self, index: Tensor) -> "_Plans":
         problem, first, placed, total = (part[index] for part in self[:4])
-        return _Plans(problem, first, placed, total, self.state.rows(index))
+        return _Plans(problem, first, placed, total, self.state.rows(index), self.awaits[index])
 
 
 class Beam(MapPlanner):
@@ -68,7 +69,7 @@ class Beam(MapPlanner):
         start, number = perf_counter(), torch.arange(len(state.surface), device=state.surface.device)
         # A robot's state and maps have height units of their own; the plans have those of the policy.
         nothing = torch.zeros_like(number)
-        plans = _Plans(number, nothing - 1, nothing, nothing.float(), State.from_observation(observation))
+        plans = _Plans(number, nothing - 1, nothing, nothing.float(), State.from_observation(observation), nothing > 0)
         mask, ended = self.policy.with_cell(cell).ranked(maps), []
         for depth in range(self.depth + 1):
             goes_on = mask.any(1)
@@ -91,7 +92,7 @@ class Beam(MapPlanner):
     def _without_choice(self, plans: _Plans) -> _Plans:
         """Return plans that cannot go on. The value of their state is 0 unless an unseen item may still fit."""
         placed = plans.placed * self.policy.value_network().reward_scale
-        return plans._replace(total=torch.where(awaits_unseen(self.cell, plans.state), plans.total, placed))
+        return plans._replace(total=torch.where(plans.awaits, plans.total, placed))
 
     def _is_late(self, start: float, depth: int) -> bool:
         """Return whether one more placement, if it takes as long as those before it, would exceed the budget."""
@@ -115,7 +116,8 @@ class Beam(MapPlanner):
         first = torch.where(plans.first[row] < 0, choice, plans.first[row])
         # The states of all plans would not fit into the memory; those of the kept ones are computed again.
         after, _ = put_down(self.cell, plans.state.rows(row), choice)
-        return _Plans(plans.problem[row], first, placed[kept], total[kept], let_in(self.cell, after))
+        state, awaits = let_in(self.cell, after)
+        return _Plans(plans.problem[row], first, placed[kept], total[kept], state, awaits | plans.awaits[row])
 
     def _judge(self, plans: _Plans, row: Tensor, choice: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the placed volume, the total and the :func:`_fingerprint` of plans extended by a choice, ``[C]`` each.

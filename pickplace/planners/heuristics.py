@@ -73,6 +73,9 @@ class RandomFeasible(MapPlanner):
         mask = observation.get("action_mask", None)
         return super().decide(observation) if mask is None else self._draw(mask)
 
+    def restart(self) -> None:
+        self._generator = None
+
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
         return self._draw(action_mask(cell, maps))
 
@@ -103,6 +106,10 @@ class _Cheapest(MapPlanner):
         Args:
             distance: from the tote's origin, ``x + y``, int64 ``[W_T, D_T]``.
         """
+
+    def height_units(self, cell: CellSpec) -> float:
+        """Return the number of the planner's height units in one of ``cell``: a robot counts in millimetres."""
+        return cell.height_unit / self.cell.height_unit
 
     def choose(self, cell: CellSpec, state: State, maps: PlacingMaps, observation: Observation) -> Tensor:
         feasible = restrict_items(cell, self.item, state, choice_mask(cell, maps))
@@ -149,7 +156,7 @@ class Corner(_Cheapest):
         self.height_weight = number("planner.height_weight", height_weight)
 
     def cost(self, cell: CellSpec, state: State, maps: PlacingMaps, distance: Tensor) -> Tensor:
-        return self.height_weight * maps.top + distance
+        return self.height_weight * self.height_units(cell) * maps.top + distance
 
 
 class HeightmapMinimisation(_Cheapest):
@@ -175,7 +182,7 @@ class HeightmapMinimisation(_Cheapest):
         before = rectangle_sums((surface >> 1).permute(1, 2, 0)[None], *footprint_sizes(cell, item))
         # The item's volume, and the empty space that it encloses below itself.
         added = (item.w * item.d).view(-1, 1, 1, 1) * maps.top - before.permute(3, 0, 1, 2)
-        return added + self.distance_weight * distance.double()
+        return added.double() * self.height_units(cell) + self.distance_weight * distance.double()
 
 
 class IndividualHeuristic(MapPlanner):

@@ -10,7 +10,7 @@ from pickplace.items.arrival import refill
 from pickplace.items.distributions import ItemDistribution, check_seed, search_items
 from pickplace.planners.base import MapPlanner
 from pickplace.policies.base import MASKED, EstimatesValue, Policy, ScoresFootprints, best_choice
-from pickplace.rules.bin import awaits_unseen, let_in
+from pickplace.rules.bin import let_in
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Item, Observation
 from pickplace.rules.masks import PlacingMaps, first_action_reaching, placing_maps
@@ -91,6 +91,9 @@ class Lookahead(MapPlanner):
         value, choice = (part[:, : self.candidates] for part in logits.sort(dim=1, descending=True, stable=True))
         best = self._best(State.from_observation(observation), choice, value > MASKED / 2)
         return first_action_reaching(cell, maps, choice.gather(1, best[:, None])[:, 0])
+
+    def restart(self) -> None:
+        self._decisions = 0
 
     def evaluation_facts(self) -> dict:
         return {"candidates": "all", "mask_at_decision": True}  # like planner=policy
@@ -177,8 +180,7 @@ class Lookahead(MapPlanner):
                 volume[row] += self.critic(seen)[:, 0].double()
                 break
             address = seed[row], stream[row], arrived
-            state = let_in(cell, state)
-            open_ = awaits_unseen(cell, state)
+            state, open_ = let_in(cell, state)
             items, arrived = refill(cell, source, "train", *address, state.items, open_, state.episode)
             state = state._replace(items=items)
             mask = policy.ranked(placing_maps(cell, state))

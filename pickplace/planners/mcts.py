@@ -12,7 +12,7 @@ from pickplace.common.validate import flag, number, refuse_if, whole_number
 from pickplace.items.arrival import refill
 from pickplace.items.distributions import ItemDistribution, check_seed, search_items
 from pickplace.planners.base import MapPlanner, narrow_first
-from pickplace.rules.bin import awaits_unseen, let_in, remove_item
+from pickplace.rules.bin import let_in, remove_item
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Item, Observation
 from pickplace.rules.masks import (
@@ -105,8 +105,11 @@ class MCTS(MapPlanner):
         self.exploration = number("planner.exploration", exploration, most=1e6)
         self.widening = number("planner.widening", widening, most=1)
         self.seed = check_seed(seed, "planner.seed")
-        self._random = np.random.default_rng(seed)
-        self._sampled, self._depths, self._walks = 0, 0, 0
+        self._depths, self._walks = 0, 0
+        self.restart()
+
+    def restart(self) -> None:
+        self._random, self._sampled = np.random.default_rng(self.seed), 0
 
     def decide(self, observation: Observation) -> Tensor:
         if self.mask:
@@ -233,8 +236,7 @@ class MCTS(MapPlanner):
 
         Unseen items come from the item distribution, with one draw for each state.
         """
-        state = let_in(self.cell, state)
-        rows = awaits_unseen(self.cell, state)
+        state, rows = let_in(self.cell, state)
         number = torch.arange(self._sampled, self._sampled + len(state.surface))
         self._sampled += len(number)
         seed, first = torch.full_like(number, self.seed), torch.zeros_like(number)

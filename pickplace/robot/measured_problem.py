@@ -46,8 +46,8 @@ from pickplace.rules.state import State, surface_from
 class MeasuredItem(NamedTuple):
     """An item on a grid along its sides, and the data that decide which actions succeed with it."""
 
-    limits: Limits  # of the robot on this item
-    cell: CellSpec  # with these limits
+    limits: Limits  # of the robot on this item, whichever item its picks take
+    cell: CellSpec  # with the limits, without the picks that take another item
     measured: MeasuredMaps
     sides: tuple[float, float]  # of the item, in cells
     bin_clear: Tensor  # bool [P], see `failures`
@@ -79,7 +79,7 @@ class MeasuredProblem(Problem):
         flat = torch.zeros_like(self.tote.highest)
         empty = self.tote._replace(highest=flat, lowest=flat, bears=torch.ones_like(self.tote.bears))
         return any(
-            footprint_mask(part.cell, measured_maps(part.cell, empty, part.measured.maps.item, part.sides).maps).any()
+            _has_place(part, measured_maps(part.cell, empty, part.measured.maps.item, part.sides))
             for part in self.parts
         )
 
@@ -114,7 +114,10 @@ class MeasuredProblem(Problem):
 def read_metric(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence[float]] = ()) -> Problem:
     """Return the problem of a scene in metres; see :meth:`Planner.plan` for arguments and errors."""
     cell_size = cast(float, scene.cell_size)
-    boxes, clearance = _read_boxes(cell, scene, cell_size)
+    by_name, clearance = _read_boxes(cell, scene, cell_size)
+    coming = {f"coming[{at}]": box.upright() for at, box in enumerate(scene.coming or ())}
+    _check_in_bin(cell, by_name | coming, cell_size)
+    names, boxes = [*by_name], [*by_name.values()]
     error = clearance if scene.placement_error is None else scene.placement_error
     tote = _read_tote(cell, scene, cell_size * cell.height_unit, error / cell_size, device)
     numbers = [place for place, box in enumerate(boxes) if not isinstance(box, HiddenBox)]
@@ -123,7 +126,7 @@ def read_metric(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence
         f"items: got {len(boxes)} that are hidden in part or unknown, which are not picked; expected one that is seen.",
         DepthMapError,
     )
-    each = [_on_grid(cell, boxes[place], cell_size, clearance, f"items[{place}]", device) for place in numbers]
+    each = [_on_grid(cell, boxes[place], cell_size, clearance, names[place], device) for place in numbers]
     items = join_items(each)
     # Only the area that an item surely covers decides where it is gripped, and what supports it.
     sides = [
@@ -141,7 +144,6 @@ def read_metric(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence
     )
     loads = read_loads(scene, tote, len(tote.highest) // cell.tote_size[0])
     insets = [_inset(item, side, clearance / cell_size) for item, side in zip(each, sides, strict=True)]
-    taken = _taken_items(free, each, insets)
     parts = []
     for index, (place, item) in enumerate(zip(numbers, each, strict=True)):
         grip = int(item.h) + tote.accuracy
@@ -149,11 +151,15 @@ def read_metric(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence
         bin_clear = torch.from_numpy(_clear_picks(cell, scene, place, boxes, centres, clearance)).to(device)
         limits = _limits(cell, free, bin_clear, centres / cell_size, grip, 2 * tote.accuracy)
         allowed = torch.from_numpy(~is_excluded(exclude, centres, cell_size)).to(device)
-        limits = replace(limits, pick_ok=limits.pick_ok & (taken == index) & allowed)
+        limits = replace(limits, pick_ok=limits.pick_ok & allowed)
         limited = replace(free, reach=limits, item_inset=insets[index])
         measured = measured_maps(limited, tote, item, sides[index], loads)
         parts.append(MeasuredItem(limits, limited, measured, sides[index], bin_clear, centres, grip * MILLIMETRE))
-    joint, maps = _join(parts, items)
+    taken = _taken_items(parts)
+    for index, part in enumerate(parts):
+        own = replace(part.limits, pick_ok=part.limits.pick_ok & (taken == index))
+        parts[index] = part._replace(cell=replace(part.cell, reach=own))
+    joint, maps = _join(parts, items, taken)
     # A policy sees heights as in training.
     ratio = cell_size * cell.height_unit / MILLIMETRE
     state, seen_rim = tote.state(free, each[0])._replace(items=items), max(1, round(tote.height / ratio))
@@ -163,18 +169,17 @@ def read_metric(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence
         return items._replace(h=(items.h.double() / ratio).round().long().clamp(min=1))
 
     seen = State(surface_from(heights, tote.bears[None]), torch.tensor([seen_rim], device=device), in_units(items))
-    if scene.coming:
-        seen = seen._replace(coming=in_units(join_items([
-            _on_grid(cell, box.upright(), cell_size, clearance, f"coming[{number}]", device)
-            for number, box in enumerate(scene.coming)
-        ])))  # fmt: skip
+    if coming:
+        arriving = [_on_grid(cell, box, cell_size, clearance, name, device) for name, box in coming.items()]
+        seen = seen._replace(coming=in_units(join_items(arriving)))
     return MeasuredProblem(
         cell=joint, state=state, seen=seen, maps=maps, boxes=[boxes[place] for place in numbers], numbers=numbers,
-        side=cell_size, unit=MILLIMETRE, release=2 * tote.accuracy * MILLIMETRE, parts=parts, tote=tote, taken=taken,
+        names=[names[place] for place in numbers], side=cell_size, unit=MILLIMETRE,
+        release=2 * tote.accuracy * MILLIMETRE, parts=parts, tote=tote, taken=taken,
     )  # fmt: skip
 
 
-def _join(parts: list[MeasuredItem], items: Item) -> tuple[CellSpec, PlacingMaps]:
+def _join(parts: list[MeasuredItem], items: Item, taken: Tensor) -> tuple[CellSpec, PlacingMaps]:
     """Return the cell and the maps of all items ``[1, M]``; for several items, the maps forbid the picks that fail.
 
     The cell's inset is the least of all items, so that it excludes no pick that grips one of them.
@@ -185,7 +190,7 @@ def _join(parts: list[MeasuredItem], items: Item) -> tuple[CellSpec, PlacingMaps
     joined: dict[str, Any] = {
         key: torch.cat([getattr(maps, key) for maps in each]) for key in ("top", "clearance", "rest", "greatest_top")
     }
-    blocked = ~torch.stack([part.limits.pick_ok for part in parts])
+    blocked = ~torch.stack([part.limits.pick_ok & (taken == index) for index, part in enumerate(parts)])
     maps = each[0]._replace(**joined, item=items.rows(0), blocked=blocked, bin_items=len(parts))
     reach = replace(parts[0].limits, pick_ok=torch.ones_like(blocked[0]))
     inset_x, inset_y = (min(side) for side in zip(*(part.cell.item_inset for part in parts), strict=True))
@@ -200,15 +205,27 @@ def _inset(item: Item, sides: tuple[float, float], clearance: float) -> tuple[in
     return x, y
 
 
-def _taken_items(cell: CellSpec, items: list[Item], insets: list[tuple[int, int]]) -> Tensor:
+def _taken_items(parts: list[MeasuredItem]) -> Tensor:
     """Return the number of the item that each pick cell takes, int64 ``[P]``; -1 if it grips none.
 
-    Each item has a grid of its own. A pick cell that grips several items takes the highest, as by the rules.
+    Each item has a grid of its own, so a pick cell may grip several items, each at another point of the bin. It takes
+    the highest that can be picked there and has a place in the tote, else the highest.
     """
-    free = replace(cell, reach=None)
-    lifted = [all_grasps(replace(free, item_inset=own), item)[0] for item, own in zip(items, insets, strict=True)]
-    height = torch.where(torch.cat(lifted), torch.cat([item.h for item in items])[:, None], 0)  # [M, P]
+    items = [part.measured.maps.item for part in parts]
+    gripped = torch.cat(
+        [all_grasps(replace(part.cell, reach=None), item)[0] for part, item in zip(parts, items, strict=True)]
+    )  # [M, P]
+    height = torch.cat([item.h for item in items])[:, None]
+    if (gripped.sum(0) > 1).any():
+        usable = [part.limits.pick_ok & _has_place(part, part.measured) for part in parts]
+        height = height + torch.stack(usable) * FAR
+    height = torch.where(gripped, height, 0)
     return torch.where(height.any(0), height.argmax(0), -1)
+
+
+def _has_place(part: MeasuredItem, measured: MeasuredMaps) -> bool:
+    """Return whether the item can be placed in a tote, whichever item its picks take."""
+    return bool(footprint_mask(replace(part.cell, reach=part.limits), measured.maps).any())
 
 
 def _effector_centres(cell: CellSpec, item: Item, box: Box, side: float) -> np.ndarray:
@@ -225,8 +242,9 @@ def _effector_centres(cell: CellSpec, item: Item, box: Box, side: float) -> np.n
     return np.array((box.x, box.y)) + side * along @ turned_axes(math.radians(box.yaw))
 
 
-def _read_boxes(cell: CellSpec, scene: Scene, side: float) -> tuple[list[Box], float]:
-    """Return the boxes in the bin, and their clearance, m: 0 if a map with one value a cell shows them."""
+def _read_boxes(cell: CellSpec, scene: Scene, side: float) -> tuple[dict[str, Box], float]:
+    """Return the boxes in the bin by their names in messages, and their clearance, m: 0 if a map with one value a cell
+    shows them."""
     accuracy, clearance = scene.accuracy, scene.clearance
     if isinstance(scene.items, BinMap):
         least = -max(4 * accuracy, 0.01)
@@ -234,26 +252,34 @@ def _read_boxes(cell: CellSpec, scene: Scene, side: float) -> tuple[list[Box], f
         is_cell_map, square = len(heights) == cell.bin_size[0], side * cell.bin_size[0] / len(heights)
         clearance = 0.0 if is_cell_map else clearance
         labels = scene.items.labels
-        boxes = [
-            box_of_map(
+        boxes = {
+            f"bin_depth{name}": box_of_map(
                 heights if labels is None else np.where(segment, heights, 0.0), square, accuracy, is_cell_map, name
             )
             for name, segment in segments_of_map(labels, heights, least_height(accuracy)).items()
-        ]
+        }
     else:
-        boxes = [box.upright() for box in scene.items]
-        for index, box in enumerate(boxes):
-            for key, size in zip("xy", cell.bin_size[:2], strict=True):
-                if not 0 <= (at := getattr(box, key)) <= size * side:
-                    raise DepthMapError(f"items[{index}].{key}={at:g}: expected 0 to {size * side:g} m, in the bin.")
-        refuse_stacked(boxes, max(clearance, accuracy))
-    for index, box in enumerate(boxes):
+        boxes = {f"items[{at}]": box.upright() for at, box in enumerate(scene.items)}
+        refuse_stacked([*boxes.values()], max(clearance, accuracy))
+    return boxes, clearance
+
+
+def _check_in_bin(cell: CellSpec, boxes: dict[str, Box], side: float) -> None:
+    """Refuse a box whose centre lies outside the bin, or that the robot cannot turn back."""
+    for name, box in boxes.items():
+        for key, size in zip("xy", cell.bin_size[:2], strict=True):
+            if not 0 <= (at := getattr(box, key)) <= size * side:
+                raise DepthMapError(f"{_field(name, key)}={at:g}: expected 0 to {size * side:g} m, in the bin.")
         refuse_if(
             cell.rotations == 1 and abs(box.yaw) > ROUNDING,
-            f"items[{index}].yaw={box.yaw:g}: expected 0 with rotations=1: this robot turns nothing.",
+            f"{_field(name, 'yaw')}={box.yaw:g}: expected 0 with rotations=1: this robot turns nothing.",
             DepthMapError,
         )
-    return boxes, clearance
+
+
+def _field(name: str, key: str) -> str:
+    """Return the name of a field of a box in messages: of one in a list, or of one that a map shows."""
+    return f"{name}.{key}" if name.endswith("]") else f"{name}: {key}"
 
 
 def _read_tote(cell: CellSpec, scene: Scene, unit: float, error: float, device) -> MeasuredTote:
@@ -288,7 +314,7 @@ def _on_grid(cell: CellSpec, box: Box, cell_size: float, clearance: float, name:
     for key, size, most_cells in zip("wd", whole, cell.bin_size[:2], strict=True):
         refuse_if(
             size > most_cells,
-            f"{name}.{key}={getattr(box, key):g}: with its clearance it takes {size} cells; expected at most "
+            f"{_field(name, key)}={getattr(box, key):g}: with its clearance it takes {size} cells; expected at most "
             f"{most_cells}, those of the bin.",
             DepthMapError,
         )

@@ -1,7 +1,5 @@
 """The planner for a robot cell: from depth maps or measured boxes to one pick and one place, or the reasons for none.
 
-Several items may lie in the bin; the planner chooses one of them.
-
 Frames of reference (see ``docs/robot.md``): the bin and the tote have a frame each. The origin is the outer corner of
 cell ``(0, 0)`` on the inner floor; x runs along the first axis of the depth map, y along the second, z upwards. Cell
 ``(i, j)`` covers ``[i, i + 1) x [j, j + 1)`` cells. A rotation turns the end effector, with the item, counter-clockwise
@@ -68,8 +66,8 @@ class Plan:
     #: "ok"; "stuck": no action is feasible; "impossible": no action would be feasible in an empty tote either;
     #: "rejected": some action is feasible, but not the one that the planner chooses
     status: str
-    #: the item that is taken, as the policy sees it: x, y, w, d in cells, h in height units; None if several items lie
-    #: in the bin and none is taken
+    #: the item of :attr:`item_number`, as the policy sees it: x, y, w, d in cells, h in height units; None if several
+    #: items lie in the bin and none is chosen
     item: dict[str, int] | None
     #: the same item as measured, in metres, with its yaw brought above -45 and to at most 45 degrees, which may
     #: exchange ``w`` and ``d``; None without cell_size
@@ -83,11 +81,11 @@ class Plan:
     occupancy_before: float  #: share of the tote's volume below the surface that the depth map shows, 0 to 1
     occupancy_after: float  #: the same with the item
     alternatives: list[Alternative]  #: the most probable choices, best first; none if nothing is feasible
-    reasons: dict[str, int] | None  #: if stuck or impossible: how many of all flat actions fail for each reason
+    reasons: dict[str, int] | None  #: how many flat actions fail for each reason; if rejected, of the chosen one
     #: with ``support="bearing"``: 1 where the tote bears weight once the item rests, for the next call; else None
     tote_bearing: list[list[int]] | None
     warnings: list[str]  #: a sentence for each thing that lies outside the policy's training
-    #: of the item that is taken, from 0: in ``items``, or among the ascending labels; None if none is taken
+    #: of the item that is taken, or that was chosen if rejected, from 0: in ``items``, or among the ascending labels
     item_number: int | None = None
     #: if stuck or impossible: a sentence for each item that the gripper cannot grip, wherever it lies; such as
     #: "items[1]: the cup does not fit on this item; no pick takes it."
@@ -202,17 +200,19 @@ class Planner:
         problem = (read_metric if is_metric else read_grid)(self.cell, scene, device, exclude)
         planner, terms = self._planner_of(problem.maps.bin_items, len(scene.coming or ()), is_metric)
         observation = observe(terms, problem.cell, problem.seen)
+        planner.restart()
         status, action, ranking = _decide(planner, problem, observation)
-        if action is None:
-            self._refuse_unknown(scene, device)
         number = None if action is None else int(problem.taken_items(action))
+        reasons = None if status == "ok" else _reasons(problem, action)
+        if reasons is not None:
+            self._refuse_unknown(scene, device)
+            action = None
         known = 0 if problem.maps.bin_items == 1 else number
-        pick, place, turn, drop_height = (None,) * 4 if action is None else problem.motion(action)
+        motion = None if action is None else problem.motion(action)
+        pick, place, turn, drop_height = motion or (None,) * 4
         seen = None if known is None else problem.seen.items.cuboids[0, known].tolist()
         box = None if known is None or not problem.boxes else problem.boxes[known]
-        placed = None
-        if box and pick and place and turn is not None and drop_height is not None:
-            placed = _at_rest(box, pick, place, turn, drop_height)
+        placed = None if box is None or motion is None else _at_rest(box, *motion)
         (before, gained), bearing = problem.shares(number or 0), problem.bearing_after(action)
         return Plan(
             status=status,
@@ -226,9 +226,9 @@ class Planner:
             occupancy_before=before,
             occupancy_after=before if action is None else before + gained,
             alternatives=_list_alternatives(planner, problem, ranking, action, alternatives),
-            reasons=_reasons(problem) if status in ("stuck", "impossible") else None,
+            reasons=reasons,
             tote_bearing=bearing.int().tolist() if self.cell.support.marks_bearing else None,
-            warnings=[] if self.training is None else self.training.warnings(self.cell, problem.seen.items),
+            warnings=[] if self.training is None else self.training.warnings(self.cell, problem.seen),
             item_number=None if number is None else problem.numbers[number],
             hints=problem.hints() if status in ("stuck", "impossible") else [],
             placed=placed,
@@ -269,8 +269,7 @@ class Planner:
     def _make(self, cell: CellSpec, policy: Policy | None, terms: Mapping[str, Term]) -> MapPlanner:
         """Make the planner of the settings for a cell, a policy of this cell and the terms of the observation."""
         assert self._settings is not None
-        name = self._settings["_target_"]
-        maker = find("planner", name)
+        maker = find("planner", name := self._settings["_target_"])
         parts, needs = {**self._parts, "policy": policy, "terms": terms}, getattr(maker, "needs", ())
         for key in ("policy", "items"):
             refuse_if(
@@ -329,7 +328,7 @@ def _several_items(policy, count: int) -> DepthMapError:
 def _decide(
     planner: MapPlanner, problem: Problem, observation: Observation
 ) -> tuple[str, Tensor | None, Ranking | None]:
-    """Return the status, the action if it succeeds, and the policy's ranking if a policy was asked; else None."""
+    """Return the status, the action if one is feasible, and the policy's ranking if a policy was asked; else None."""
     if not footprint_mask(problem.cell, problem.maps).any():
         return "stuck" if problem.is_feasible_in_an_empty_tote() else "impossible", None, None
     cell, ranking = problem.cell, None
@@ -342,12 +341,13 @@ def _decide(
         return ranking.action
 
     action = decide(planner, cell, observation, choose)
-    status = "ok" if int(problem.failures(action)) == 0 else "rejected"
-    return status, action if status == "ok" else None, ranking
+    return "ok" if int(problem.failures(action)) == 0 else "rejected", action, ranking
 
 
-def _reasons(problem: Problem) -> dict[str, int]:
-    """Count the flat actions that fail for each reason, each with the item that its pick takes."""
+def _reasons(problem: Problem, chosen: Tensor | None) -> dict[str, int]:
+    """Count the flat actions that fail for each reason, each with the item that its pick takes; or only the chosen."""
+    if chosen is not None:
+        return {Failure(int(problem.failures(chosen))).name.lower(): 1}
     cell, device = problem.cell, problem.state.surface.device
     picks = torch.arange(cell.num_picks, device=device)
     codes = problem.failures(join_pick(cell, picks, 0))

@@ -64,6 +64,7 @@ class Problem(ABC):
     seen: State  # the state as a policy sees it, in the height units of its training
     boxes: Sequence[Box] = ()  # the items as they were measured; none on the grid
     numbers: Sequence[int]  # of the items, in the scene
+    names: Sequence[str]  # of the items, in messages
     side: float = 1.0  # length of a cell
     unit: float = 1.0  # length of a height unit
     release: float = 0.0  # height of the suction face above the item's planned top when it lets go
@@ -110,8 +111,8 @@ class Problem(ABC):
         """Return a sentence for each item that the gripper cannot grip, wherever it lies."""
         gripper, sides = self.cell.gripper, zip(*(part[0].tolist() for part in self.state.items[2:4]), strict=True)
         return [
-            f"items[{number}]: {gripper.misfit}; no pick takes it."
-            for number, (w, d), inset in zip(self.numbers, sides, self.insets, strict=True)
+            f"{name}: {gripper.misfit}; no pick takes it."
+            for name, (w, d), inset in zip(self.names, sides, self.insets, strict=True)
             if not gripper.can_grip(w, d, inset)
         ]
 
@@ -199,9 +200,11 @@ def read_grid(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence[f
     height = cell.tote_size[2] if scene.tote_height is None else round(scene.tote_height)
     bin_map = whole_map("bin_depth", scene.items.depth, cell.bin_size[:2], FAR, unit)
     tote_map = torch.from_numpy(whole_map("tote_depth", scene.tote, cell.tote_size[:2], height, unit))
+    segments = segments_of_map(scene.items.labels, bin_map, 0)
+    names = [f"bin_depth{name}" for name in segments]
     items = [
-        check_longest(cell, _read_cuboid(bin_map, segment, unit, name), "bin_depth")
-        for name, segment in segments_of_map(scene.items.labels, bin_map, 0).items()
+        check_longest(cell, _read_cuboid(bin_map, segment, unit, name), f"bin_depth{name}")
+        for name, segment in segments.items()
     ]
     state = State(
         surface_from(height - tote_map, read_bearing(cell, scene.tote_bearing, tote_map == height))[None].to(device),
@@ -212,8 +215,9 @@ def read_grid(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence[f
     cell = without_excluded(replace(cell, bin_items=len(items), bin_size=(*cell.bin_size[:2], wall)), exclude)
     facts = FailureMaps.of(cell, state)
     return GridProblem(
-        cell=cell, state=state, maps=facts.placing_maps(cell), seen=state, numbers=range(len(items)), facts=facts
-    )
+        cell=cell, state=state, maps=facts.placing_maps(cell), seen=state, numbers=range(len(items)), names=names,
+        facts=facts,
+    )  # fmt: skip
 
 
 def join_items(items: list[Item]) -> Item:

@@ -8,7 +8,7 @@ from omegaconf import DictConfig, OmegaConf
 from pickplace.items.distributions import ItemDistribution
 from pickplace.policies.restore import build_cell, cell_settings, differences
 from pickplace.rules.cell import CellSpec
-from pickplace.rules.item import Item
+from pickplace.rules.state import State
 
 #: Options of the cell, beside the sizes, that should be the same as in a policy's training.
 RULES = ("support", "gripper")
@@ -33,13 +33,14 @@ class TrainingEnvelope:
         # No table of reach is read, as its file may be missing here.
         return cls(kinds, build_cell(cast(dict, OmegaConf.to_container(config.env, resolve=True)), reach=None))
 
-    def warnings(self, cell: CellSpec, items: Item) -> list[str]:
+    def warnings(self, cell: CellSpec, state: State) -> list[str]:
         """Return a sentence for each thing that the policy never met: an item, the tote, the end effector, the rule.
 
         Args:
-            cell: the sizes.
-            items: all in the bin, ``[1, M]``, as the policy sees them.
+            cell: the sizes, but for the tote's height.
+            state: of one problem, as the policy sees it.
         """
+        items, tote_size = state.items, (*cell.tote_size[:2], int(state.tote_height))
         known, longest = self.cell, [max(kind[axis] for kind in self.kinds) for axis in range(3)]
         found = sorted(
             {
@@ -50,8 +51,8 @@ class TrainingEnvelope:
         )
         if (count := items.x.shape[1]) > known.bin_items:
             found.append(f"{count} items in the bin: the policy met at most {known.bin_items}.")
-        if known.tote_size[:2] != cell.tote_size[:2] or cell.tote_size[2] > known.tote_size[2]:
-            found.append(f"tote of {_sides(cell.tote_size)} cells: the policy met {_sides(known.tote_size)}.")
+        if known.tote_size[:2] != tote_size[:2] or tote_size[2] > known.tote_size[2]:
+            found.append(f"tote of {_sides(tote_size)} cells: the policy met {_sides(known.tote_size)}.")
         return found + [
             f"{key}={ours}: the policy met {key}={theirs}."
             for key, ours, theirs in differences(cell_settings(cell, RULES), cell_settings(known, RULES))

@@ -171,22 +171,18 @@ def is_below_limit(items: Item, differs: Episode) -> Tensor:
     return below if differs.bin_items is None else below & (items.exists.sum(1) < differs.bin_items)
 
 
-def awaits_unseen(cell: CellSpec, state: State) -> Tensor:
-    """Return whether an item that is not seen yet may arrive next, before any is taken, bool ``[N]``."""
-    open_ = may_arrive(cell, state.items, state.episode) & is_below_limit(state.items, state.episode)
-    return open_ if state.coming is None else open_ & ~state.coming.exists[:, 0]
-
-
-def let_in(cell: CellSpec, state: State) -> State:
-    """Return the state after the items of the preview have arrived, as far as the bins have room.
+def let_in(cell: CellSpec, state: State) -> tuple[State, Tensor]:
+    """Return the state after the items of the preview have arrived, as far as the bins have room, and the bins in
+    which an item that is not seen yet arrives next, bool ``[N]``.
 
     In an empty bin an item lies at its own place, as in the environment. In any other bin it lies at the first free
     place; the environment draws one at random.
     """
     _, _, items, differs, _, coming = state
+    awaits = may_arrive(cell, items, differs)  # asked once: the items of a batch arrive together
     if coming is None:
-        return state
-    open_, first = may_arrive(cell, items, differs), torch.zeros_like(state.tote_height)
+        return state, awaits & is_below_limit(items, differs)
+    open_, first = awaits, torch.zeros_like(state.tote_height)
     for _ in range(items.x.shape[1]):
         open_ = open_ & is_below_limit(items, differs)
         item = select_item(coming, first)
@@ -196,4 +192,5 @@ def let_in(cell: CellSpec, state: State) -> State:
         if not any_of(open_):
             break
         items, coming = add_item(items, item, open_), remove_item(cell, coming, first, open_)
-    return state._replace(items=items, coming=coming)
+    awaits = awaits & is_below_limit(items, differs) & ~coming.exists[:, 0]
+    return state._replace(items=items, coming=coming), awaits

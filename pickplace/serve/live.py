@@ -80,6 +80,7 @@ def _scene(cell: CellSpec, request: PlanRequest, plan: dict) -> dict:
         "heights": heights.clip(0, None).round(3).tolist(),
         "item": box and [*(box[key] * along for key in "xywd"), box["h"] * up, box["yaw"]],
         "lengths": box and [box["w"], box["d"], box["h"]],
+        "coming": [[box.w, box.d, box.h] for box in request.coming or ()],
         "unit": "cells" if side is None else "m",
         "pick": pose("pick"),
         "place": pose("place"),

@@ -3,16 +3,20 @@
 import tempfile
 from pathlib import Path
 
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
 from pickplace import PickPlaceEnv, State
+from pickplace.items.arrival import refill
 from pickplace.items.cut import Cut
 from pickplace.items.distributions import Kinds, Recorded, Uniform
 from pickplace.items.orders import Orders
+from pickplace.planners import lookahead, mcts
 from pickplace.planners.heuristics import RandomFeasible
+from pickplace.policies.fcn_grasp.policy import FcnGrasp
 from pickplace.rules.bin import let_in
 from pickplace.rules.grasps import footprint_index
 from pickplace.rules.gripper.rules import Overlap
@@ -156,7 +160,7 @@ def test_the_state_after_a_placement_is_known(source, bin_items, refill, seed):
         x, y, w, _ = step.footprint.unbind(-1)
         footprint = footprint_index(cell.tote_size, (w != step.item.w).long(), x, y)
         expected, real = (
-            let_in(cell, put_down(cell, before, step.taken * cell.num_footprints + footprint)[0]),
+            let_in(cell, put_down(cell, before, step.taken * cell.num_footprints + footprint)[0])[0],
             State.from_observation(after),
         )
         known = before.coming.exists.sum(1) - expected.coming.exists.sum(1)  # that have arrived
@@ -178,3 +182,21 @@ def test_the_state_after_a_placement_is_known(source, bin_items, refill, seed):
                 )
         if (done := after["done"][:, 0]).any():
             slots.reset(done)
+
+
+@pytest.mark.parametrize("search", [lookahead, mcts])
+def test_a_search_imagines_whole_batches(search, monkeypatch):
+    """Of which the preview shows a part."""
+    env, bins = PickPlaceEnv(num_envs=1, bin_items=3, bin_size=(12, 12, 1), refill="batch", preview=1), []
+    data = env.reset()
+    for _ in range(2):
+        data = env.step(data.set("action", data["action_mask"].int().argmax(1)))["next"]
+    assert env.state.items.exists.sum() == 1
+    monkeypatch.setattr(search, "refill", lambda *args: bins.append(refill(*args)) or bins[-1])
+    if search is mcts:
+        planner = mcts.MCTS(env.cell, env.items, 2, True)
+    else:
+        policy = FcnGrasp(env.cell, filters=8, hidden=8)
+        planner = lookahead.Lookahead(env.cell, policy, env.items, samples=2, rounds=1)
+    planner.decide(data)
+    assert (bins[0][0].exists.sum(1) == 3).all()

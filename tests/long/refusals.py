@@ -204,7 +204,7 @@ def count(case: Case, scenes: int, seed: int, spare: float = 0.5) -> tuple[Count
 
 
 if __name__ == "__main__":
-    robot_planner._reasons = lambda problem: {}  # most of the time of a refusal
+    robot_planner._reasons = lambda *_: {}  # most of the time of a refusal
     wanted, first = map(int, (sys.argv[1:] + ["1000", "0"][len(sys.argv) - 1 :])[:2])
     for name, case in CASES.items():
         found, missed, seconds = count(case, wanted, first)

@@ -60,7 +60,7 @@ def totals(policy, state, depth):
     if len(choices) == 0 or depth == 0:
         return choices.tolist(), [0.0] * len(choices)
     after, item = put_down(policy.cell, state.repeat(len(choices)), choices)
-    after = let_in(policy.cell, after)
+    after, _ = let_in(policy.cell, after)
     values = policy.judge(state.repeat(len(choices)), choices)[2].tolist()
     if depth > 1 or after.coming is not None:
         later = [totals(policy, after.rows([row]), depth - 1)[1] for row in range(len(choices))]
@@ -138,14 +138,20 @@ def test_plans_are_the_same_if_what_comes_is():
     assert len({*numbers}) == 4
 
 
-@pytest.mark.parametrize(("preview", "depth", "place"), [(1, 2, 4), (1, 1, 4), (0, 2, 0)])
-def test_a_plan_that_strands_what_comes_is_worth_what_it_places(preview, depth, place):
+@pytest.mark.parametrize(("preview", "depth", "batch", "place"), [
+    (1, 2, 1, 4), (1, 1, 1, 4), (0, 2, 1, 0), (1, 1, 2, 0), (1, 2, 2, 0),
+])  # fmt: skip
+def test_a_plan_that_strands_what_comes_is_worth_what_it_places(preview, depth, batch, place):
     """A row of cells of which one is full. Only what goes to the last cell leaves room for an item of three cells,
-    while the policy would keep that cell free at any cost."""
-    cell = CellSpec((3, 1, 1), (5, 1, 1), Overlap((1, 1)), rotations=1, support="half", preview=preview)
+    while the policy would keep that cell free at any cost. In a batch, an unseen item comes with it."""
+    cell = CellSpec(
+        (4, 1, 1), (5, 1, 1), Overlap((1, 1)), rotations=1, support="half", preview=preview, bin_items=batch,
+        refill="batch",
+    )  # fmt: skip
     policy = untrained(cell)
     policy.network.forward = lambda depth, *_: 1 + 10 * depth[:, 4, 0, None]
-    items, coming = (Item.from_table(torch.tensor([[[0, 0, w, 1, 1]]])) for w in (1, 3))
+    single, long = [0, 0, 1, 1, 1], [0, 0, 3, 1, 1]
+    items, coming = (Item.from_table(torch.tensor([rows])) for rows in ([single] + [[0] * 5] * (batch - 1), [long]))
     surface = surface_from(torch.tensor([[[0], [0], [0], [1], [0]]]))
     state = State(surface, torch.tensor([1]), items, coming=coming if preview else None)
     seen = observe(check_terms(None, cell), cell, state)
@@ -159,7 +165,7 @@ def test_equal_outcomes_are_kept_once():
     items = Item.from_table(torch.tensor([[[0, 0, 2, 2, 1], [4, 4, 2, 2, 1]]]))
     state = State(empty, torch.tensor([3]), items)
     nothing = torch.zeros(1, dtype=torch.int64)
-    plans = _Plans(nothing, nothing - 1, nothing, nothing.float(), state)
+    plans = _Plans(nothing, nothing - 1, nothing, nothing.float(), state, nothing > 0)
     sizes = []
     with torch.no_grad():
         for _ in range(2):

@@ -1,5 +1,7 @@
 """Planners without training: the reference figures of the rules, brute force over all feasible actions, and chance."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from problems import SETTINGS, occupancies, random_states, results_by_hand, tie_by_hand
@@ -17,6 +19,8 @@ from pickplace.planners.heuristics import (
 )
 from pickplace.planners.mcts import MCTS
 from pickplace.planners.spaces import BestFit, OnlineBPH
+from pickplace.rules.masks import placing_maps
+from pickplace.rules.state import surface_from
 
 # Planner and items; tote, R, occupancy and its standard error, from an independent prototype of the rules. Where no
 # error is known (None): that of 100 episodes, as those of joint_dbl with mixed items are, and of rounding to 0.01.
@@ -98,6 +102,21 @@ def test_the_least_cost_over_all_feasible_actions_is_played(options):
                 for (_, cost), each in zip(COSTS, costs, strict=True):
                     each[action] = cost(top, y, x, raised), *tie_by_hand(found), action
             assert [each[n] for each in chosen] == [min(each, key=each.get) for each in costs]
+
+
+def test_a_cost_does_not_depend_on_the_unit_of_heights():
+    """A robot counts in millimetres."""
+    for env, observation in random_states(tote_size=(5, 5, 4), support="half"):
+        (wide, deep, rim), state = env.cell.tote_size, env.state
+        fine = replace(env.cell, tote_size=(wide, deep, 50 * rim), height_unit=env.cell.height_unit / 50)
+        measured = state._replace(
+            surface=surface_from(50 * state.heights, state.surface & 1), tote_height=50 * state.tote_height,
+            items=state.items._replace(h=50 * state.items.h),
+        )  # fmt: skip
+        for make, _ in COSTS:
+            planner = make(env.cell)
+            action = planner.choose(fine, measured, placing_maps(fine, measured), observation)
+            assert torch.equal(action, planner.decide(observation))
 
 
 def test_corner_packs_about_as_well_as_joint_dbl():

@@ -22,7 +22,7 @@ SEAL = {"effector_size": (7, 7), "body": "disc", "cup": "disc", "cup_size": (3, 
 @pytest.fixture(autouse=True)
 def no_reasons(monkeypatch):
     """Why a plan is not ok takes most of the time of a refusal."""
-    monkeypatch.setattr(robot_planner, "_reasons", lambda problem: {})
+    monkeypatch.setattr(robot_planner, "_reasons", lambda *_: {})
 
 
 def slabs(end: float) -> np.ndarray:
@@ -76,7 +76,9 @@ def test_a_plan_says_on_which_items_the_cup_does_not_fit():
     assert plan.hints == ["items[0]: the cup does not cover this item; no pick takes it."]
     depth = np.zeros((6, 6), dtype=int)
     depth[:4, :2] = 1
-    assert plan_for(plate, depth, np.full((6, 6), 5)).hints == plan.hints
+    for labels, name in ((None, "bin_depth"), (7 * depth, "bin_depth with label 7")):
+        seen = plan_for(plate, depth, np.full((6, 6), 5), bin_labels=labels)
+        assert seen.hints == [f"{name}: the cup does not cover this item; no pick takes it."]
     depth[3] = 0
     assert plan_for(plate, depth, np.full((6, 6), 0)).hints == []
 

@@ -107,7 +107,7 @@ def scenes_of(name: str, scenes: int, seed: int, **options) -> Counter:
 @pytest.mark.parametrize("scenes", [120, pytest.param(2_000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", EFFECTORS)
 def test_no_end_effector_makes_an_ok_plan_go_wrong(name, scenes, monkeypatch):
-    monkeypatch.setattr(robot_planner, "_reasons", lambda problem: {})  # why a plan is not ok: most of the time
+    monkeypatch.setattr(robot_planner, "_reasons", lambda *_: {})  # why a plan is not ok: most of the time
     found = scenes_of(name, scenes, 7)
     assert set(found) <= {"ok", "stuck", "impossible"} and found["ok"] > 15, found
 
@@ -286,6 +286,10 @@ def test_warnings_name_what_lies_outside_the_training():
     assert plan.warnings == ["support=hull: the policy met support=bearing."]
     known = plan_for(Planner.load("pretrained/r4"), items=[box], tote_depth=np.full((6, 6), 0.25), **flat)
     assert known.warnings == []
+    high = plan_for(
+        Planner.load("pretrained/r4"), items=[box], tote_depth=np.full((6, 6), 0.9), tote_height=0.9, **flat
+    )
+    assert [warning.partition(" cells")[0] for warning in high.warnings] == ["tote of 6x6x18"]
     with pytest.raises(ValueError, match="planner='uniform': it does not choose among|does not choose among feasible"):
         Planner(CellSpec(), planner="uniform")
     with pytest.raises(DepthMapError, match=r"items\[0\]: the item is 3 cells long, longer .*; expected at most 2"):

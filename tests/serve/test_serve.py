@@ -225,7 +225,8 @@ def test_strangers_pages_are_refused(client):
 
 def test_the_page_gets_the_last_answers_in_cells(client):
     before = client.ask("GET", "/plans")[2]["last"]
-    metres = {"items": [{"x": 0.1, "y": 0.125, "w": 0.08, "d": 0.04, "h": 0.05}], "cell_size": 0.05}
+    box = {"x": 0.1, "y": 0.125, "w": 0.08, "d": 0.04, "h": 0.05}
+    metres = {"items": [box], "coming": [{**box, "h": 0.07}], "cell_size": 0.05}
     depth = [[0.25 - 0.05 * (x < 10 and y < 5) for y in range(30)] for x in range(30)]
     for body in (GRID, {**metres, "tote_depth": depth}, {"id": "<b>", "tote_depth": [[5]]}):
         client.plan(body)
@@ -234,6 +235,7 @@ def test_the_page_gets_the_last_answers_in_cells(client):
     assert news["last"] == third["number"] == before + 3 and news["most"] == 3
     assert first["scene"]["item"] == [2, 2.5, 2, 1, 1, 0] and first["scene"]["heights"] == [[0] * 6] * 6
     assert second["scene"]["item"] == pytest.approx([2, 2.5, 1.6, 0.8, 1, 0])
+    assert first["scene"]["coming"] == [] and second["scene"]["coming"] == [[0.08, 0.04, 0.07]]
     heights = second["scene"]["heights"]
     assert len(heights) == 30 and sum(map(sum, heights)) == pytest.approx(50) and heights[9][4] == pytest.approx(1)
     x, y, z, _ = second["scene"]["place"]
