@@ -7,10 +7,9 @@ import logging
 import sys
 from pathlib import Path
 
-import hydra
 from omegaconf import OmegaConf
 
-from pickplace.config.composition import config_files
+from pickplace.config.composition import compose_training
 from pickplace.runs.folder import note_failure
 from pickplace.training.sweep import summarize
 from pickplace.training.train import train
@@ -30,9 +29,7 @@ def train_once(words: list[str], folder: Path) -> float:
     """Train as pickplace-train does with these overrides; return the final validation occupancy."""
     (folder / ".hydra").mkdir(parents=True)
     OmegaConf.save(OmegaConf.create(words), folder / ".hydra" / "overrides.yaml")  # for the table of the sweep
-    with config_files():
-        cfg = hydra.compose("train", words)
-    return train(cfg, folder)
+    return train(compose_training(words), folder)
 
 
 def search(study, folder: Path, trials: int, preset: list[str] = PRESET) -> None:

@@ -3,7 +3,6 @@
 from torchrl.objectives import A2CLoss
 
 from pickplace.algorithms.actor_critic import ActorCritic
-from pickplace.common.validate import refuse_if
 from pickplace.policies.base import as_actor
 
 
@@ -13,9 +12,5 @@ class A2C(ActorCritic):
     averages = True
 
     def make_loss(self, **common) -> A2CLoss:
-        refuse_if(
-            self.normalize_advantage and self.task.batch_frames == 1,
-            "algo.normalize_advantage=True: a batch of one frame (env.num_envs x rollout_length) has no variance; "
-            "expected more frames, or false.",
-        )
+        self.refuse_single_frame()
         return A2CLoss(as_actor(self.policy), self.critic, **common)

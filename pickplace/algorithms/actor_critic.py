@@ -11,7 +11,7 @@ from torchrl.objectives.value import GAE
 
 from pickplace.algorithms.base import At, Task
 from pickplace.algorithms.descent import MAX_WEIGHT, MinibatchDescent
-from pickplace.common.validate import expect, flag, number
+from pickplace.common.validate import expect, flag, number, refuse_if
 from pickplace.policies.base import EstimatesValue, Policy
 
 
@@ -73,6 +73,14 @@ class ActorCritic(MinibatchDescent):
     @abstractmethod
     def make_loss(self, **common) -> A2CLoss | ClipPPOLoss:
         """Return TorchRL's loss, with the arguments that all losses have in common."""
+
+    def refuse_single_frame(self) -> None:
+        """Refuse to normalise the advantages of a batch of one frame; they have no variance."""
+        refuse_if(
+            self.normalize_advantage and self.task.batch_frames == 1,
+            "algo.normalize_advantage=True: a batch of one frame (env.num_envs x rollout_length) has no variance; "
+            "expected more frames, or false.",
+        )
 
     def learn(self, batch: TensorDictBase, at: At) -> dict[str, float]:
         return self.descend(self.prepare(batch, at), at, self.objective)

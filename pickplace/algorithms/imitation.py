@@ -39,6 +39,7 @@ class WarmStart:
         env: an environment of the training, for its sizes, items and terms.
         seed: seed of a teacher that draws.
         trust: modules of the user whose classes the config of the teacher's checkpoint may name.
+        trained: frames of the run so far; once imitation is over, there is no teacher.
 
     Raises:
         ValueError: naming the key, for a teacher that is missing or cannot be made.
@@ -52,20 +53,21 @@ class WarmStart:
         env: PickPlaceEnv,
         seed: int,
         trust=(),
+        trained: int = 0,
     ):
         self.frames, self.critic_frames = cfg.frames, cfg.critic_frames
         self.policy, self.cell, self.seed = policy, env.cell, seed
-        if not cfg.frames:
+        if trained >= cfg.frames:
             return
         expect(cfg.teacher is not None, "warm_start.frames", cfg.frames, "0 without a teacher, or warm_start=imitate")
-        trained = None
+        teacher = None
         if cfg.checkpoint is not None:
             state, facts = checkpoint.read(locate(cfg.checkpoint))
             trained_cfg = trusted_config(facts["config"], trust)
-            trained = (trained_cfg, state, cast(dict, OmegaConf.to_container(trained_cfg.env, resolve=True)))
+            teacher = (trained_cfg, state, cast(dict, OmegaConf.to_container(trained_cfg.env, resolve=True)))
         self._draws = "seed" in (accepted_arguments(find("warm_start.teacher", cfg.teacher._target_)) or cfg.teacher)
         self._settings = cast(dict, OmegaConf.to_container(cfg.teacher, resolve=True))
-        self._parts = planner_parts(cfg.teacher, env.cell, env.items, env.terms, trained)
+        self._parts = planner_parts(cfg.teacher, env.cell, env.items, env.terms, teacher)
         self._make_teacher(0)  # refuses bad settings before the first batch
 
     def _make_teacher(self, iteration: int):

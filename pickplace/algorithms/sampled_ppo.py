@@ -47,6 +47,8 @@ class SampledPPO(PPO):
         )
 
     def make_loss(self, **common) -> ClippedLoss:
+        if self.advantages == "gae":
+            self.refuse_single_frame()
         # Advantages are normalised in prepare(): most of those that the loss sees are 0.
         return ClippedLoss(as_sampled_actor(self.policy), self.critic, clip_epsilon=self.clip_epsilon, **common)
 

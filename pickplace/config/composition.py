@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from pickplace.common.errors import unknown_key
-from pickplace.common.validate import excerpt, refuse_if
+from pickplace.common.validate import excerpt, refuse_any, refuse_if
 from pickplace.config.allowlist import walk
 from pickplace.config.registry import REGISTRY, names_at
 
@@ -77,6 +77,48 @@ def merge_search_path(words: list[str], folders: Iterable[str]) -> list[str]:
 def quoted(value) -> str:
     """Return a text as a value of an override."""
     return "'{}'".format(str(value).replace("'", "\\'"))
+
+
+def compose_training(words: list[str]) -> DictConfig:
+    """Return the config that ``pickplace-train`` makes of a command line, such as ``["experiment=quick", "seed=1"]``.
+
+    Raises:
+        ValueError: for a word that the command would refuse before it trains.
+    """
+    refuse_several_values(words)
+    running = HydraConfig.instance()
+    before = running.cfg
+    try:
+        with config_files():
+            _, cfg = compose_job("train", words)
+            check_keys(cfg, "train")
+    finally:
+        running.cfg = before
+    return cfg
+
+
+def compose_job(config_name: str, words: list[str]) -> tuple[DictConfig, DictConfig]:
+    """Return Hydra's merge of a command line, with the node ``hydra``, which is Hydra's current one from now on; and
+    the config of the run, or of the first run of a sweep."""
+    merged = compose_first_job(config_name, words)
+    HydraConfig.instance().set_config(merged)
+    cfg = own_values(OmegaConf.masked_copy(merged, [str(key) for key in merged if key != "hydra"]))
+    OmegaConf.set_struct(cfg, True)
+    return merged, cfg
+
+
+def check_keys(cfg: DictConfig, config_name: str, from_checkpoint: tuple[str, ...] = ()) -> DictConfig:
+    """Return a config; refuse values that are missing and unknown keys, but for groups ``from_checkpoint``."""
+    refuse_any(sorted(OmegaConf.missing_keys(cfg)), lambda key: f"{key}: no value; expected {key}=<value>.")
+    keys = [str(key) for key in cfg if key not in from_checkpoint]
+    refuse_unknown_keys(OmegaConf.masked_copy(cfg, keys), compose_plain(config_name))
+    return cfg
+
+
+def refuse_several_values(words: list[str]) -> None:
+    """Refuse words that only a sweep understands."""
+    several = [str(word.input_line) for word in parse(words) if word.is_sweep_override()]
+    refuse_any(several, lambda word: f"{word}: several values; expected -m for a sweep, or one value.")
 
 
 def compose_first_job(config_name: str, words: list[str]) -> DictConfig:

@@ -74,11 +74,7 @@ class Command:
             if options.info or options.hydra_help or options.version or options.shell_completion:
                 return self._start(words, flags)
             with composition.config_files():
-                merged = composition.compose_first_job(self.config_name, words)
-                HydraConfig.instance().set_config(merged)
-                keys = [str(key) for key in merged if key != "hydra"]
-                cfg = composition.own_values(OmegaConf.masked_copy(merged, keys))
-                OmegaConf.set_struct(cfg, True)
+                merged, cfg = composition.compose_job(self.config_name, words)
                 if options.help:
                     return write_output(help_text(self.config_name, merged))
                 if options.cfg == "job":
@@ -111,10 +107,7 @@ class Command:
             raise ValueError(f"{name}: there is no such flag, and keys have no dashes; expected {' or '.join(meant)}.")
 
     def _checked(self, cfg: DictConfig) -> DictConfig:
-        refuse_any(sorted(OmegaConf.missing_keys(cfg)), lambda key: f"{key}: no value; expected {key}=<value>.")
-        keys = [str(key) for key in cfg if key not in self.from_checkpoint]
-        composition.refuse_unknown_keys(OmegaConf.masked_copy(cfg, keys), composition.compose_plain(self.config_name))
-        return cfg
+        return composition.check_keys(cfg, self.config_name, self.from_checkpoint)
 
     def _start(self, words: list[str], flags: list[str], app: Callable[[DictConfig], Any] = lambda cfg: None) -> None:
         sys.argv[1:] = [*words, *flags]
@@ -146,7 +139,14 @@ class Command:
                 # The error itself may not cross processes.
                 raise ValueError(f"run {run_dir.name}: {sentence(error)}") from error
 
-        kind, settings = ("sweep", sweep_words(merged, words)) if is_sweep else ("run", [])
+        if not is_sweep:
+            composition.refuse_several_values(words)
+        kind, other = ("sweep", "run") if is_sweep else ("run", "sweep")
+        refuse_any(
+            (word for word in words if word.lstrip("+").startswith(f"hydra.{other}.dir=")),
+            lambda word: f"{word}: this is a {kind}; expected hydra.{kind}.dir=<folder>.",
+        )
+        settings = sweep_words(merged, words) if is_sweep else []
         path = merged.hydra[kind].dir  # fixed from here on: it may hold the time
         folder, notes, is_done = Path(path), [".hydra", f"{merged.hydra.job.name}.log"], False
         (self.folders.refuse_for_sweep if is_sweep else self.folders.refuse_for_run)(folder, notes)

@@ -22,7 +22,7 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from pickplace.common.files import read_file, sync_folder
-from pickplace.common.validate import excerpt, first_line, refuse_any, refuse_if, reworded
+from pickplace.common.validate import excerpt, expect, first_line, is_whole, refuse_any, refuse_if, reworded
 from pickplace.runs.locate import FACTS, MAX_BYTES, PREVIOUS, TENSORS, CheckpointError, are_facts
 
 SCHEMA = 1
@@ -76,6 +76,25 @@ def write(folder: Path, state: dict, facts: dict, keep: str | None = None) -> No
         shutil.rmtree(new, ignore_errors=True)
         raise CheckpointError(f"{folder}: the checkpoint cannot be written ({error}).") from error
     shutil.rmtree(old, ignore_errors=True)
+
+
+def check_state(state, name: str) -> None:
+    """Refuse a state that would not come back from a checkpoint as it is.
+
+    Args:
+        state: nested dicts of tensors, numbers, texts and None.
+        name: of the state, for messages.
+
+    Raises:
+        ValueError: naming the first value or key of another kind.
+    """
+    expect(isinstance(state, dict), name, state, "nested dicts of tensors, numbers and texts")
+    for key, value in state.items():
+        is_text = isinstance(key, str) and not key.isdecimal() and "|" not in key
+        expected = "a whole number, or a text that is no number and has no |"
+        expect(is_text or (is_whole(key) and key >= 0), f"{name}: the key", key, expected)
+        if not isinstance(value, Tensor | int | float | str | None):
+            check_state(value, f"{name}|{key}")
 
 
 def flatten(tree, prefix: str = "") -> tuple[dict[str, Tensor], dict]:

@@ -8,14 +8,27 @@ import logging
 import os
 from collections.abc import Callable
 from contextlib import suppress
+from numbers import Real
 from pathlib import Path
 from typing import IO, Any
 
 from pickplace.common.errors import needs_extra
 from pickplace.common.files import read_text, replaced_file
-from pickplace.common.validate import excerpt, refuse_if, reworded
+from pickplace.common.validate import excerpt, expect, refuse_if, reworded
 
 log = logging.getLogger(__name__)
+
+
+def check_metrics(owner: str, metrics: Any) -> None:
+    """Refuse metrics that no logger can write.
+
+    Raises:
+        ValueError: naming the ``owner``, the setting whose code has logged them.
+    """
+    expect(isinstance(metrics, dict), f"{owner}: its metrics", metrics, "{name: number}")
+    for key, value in metrics.items():
+        expect(isinstance(key, str) and key != "frames", f"{owner}: it logs", key, "another name")
+        expect(isinstance(value, Real), f"{owner}: it logs {key}", value, "a number")
 
 
 class CsvLogger:

@@ -39,6 +39,9 @@ FIXED_KEYS = (
     "seed", "items", "model.mask_infeasible", "collector.workers", "curriculum.levels", "warm_start.weights",
 )  # fmt: skip
 
+#: Settings that change nothing in what is trained and validated.
+SILENT_KEYS = ("quiet", "threads", "progress_interval", "checkpoint_interval", "logger")
+
 
 def checkpoint_config(cfg: DictConfig) -> tuple[dict, str]:
     """Return the config as checkpoints store it, and the words to repeat on resume, such as `` trust=[my_models]``.
@@ -171,6 +174,12 @@ def stale_best_frames(run_dir: Path, frames: int, config: dict) -> int | None:
 def has_config(facts: dict, config: dict) -> bool:
     """Return whether a checkpoint has this config, given in the form that checkpoints store."""
     return facts["config"] == json.loads(json.dumps(config))
+
+
+def is_trained_alike(facts: dict, config: dict) -> bool:
+    """Return whether a checkpoint has this config but for :data:`SILENT_KEYS`, in the form that checkpoints store."""
+    before, now = ({**each, **dict.fromkeys(SILENT_KEYS)} for each in (facts["config"], config))
+    return has_config({"config": before}, now)
 
 
 def is_validated_alike(facts: dict, config: dict) -> bool:

@@ -1,13 +1,13 @@
 """Callbacks (config group ``callbacks``): a user's code at each batch, validation and change of level of a training."""
 
 import json
-from numbers import Real
 from typing import Any
 
 from pickplace.common.errors import sentence
 from pickplace.common.validate import expect, number, or_null, refuse_if, whole_number
 from pickplace.config.registry import build
 from pickplace.evaluation.play import Episodes
+from pickplace.runs.loggers import check_metrics
 
 
 class Callback:
@@ -125,15 +125,15 @@ def call(callbacks: dict[str, Callback], hook: str, trainer: Any, *arguments: An
     """Call a hook of each callback.
 
     Raises:
-        ValueError: naming the callback, for a metric that it removes or that is no number.
+        ValueError: naming the callback, for a metric that it removes or that no logger can write.
     """
     metrics = arguments[-1] if isinstance(arguments[-1], dict) else {}
     for name, callback in callbacks.items():
-        before = list(metrics)
+        before = dict(metrics)
         getattr(callback, hook)(trainer, *arguments)
         for key in before:
             refuse_if(
                 key not in metrics, f"callbacks.{name}: it removes {key} from the metrics; expected changed values."
             )
-        for key, value in metrics.items():
-            expect(isinstance(value, Real), f"callbacks.{name}: it logs {key}", value, "a number")
+        changed = {key: value for key, value in metrics.items() if key not in before or value is not before[key]}
+        check_metrics(f"callbacks.{name}", changed)

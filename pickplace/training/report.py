@@ -13,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from pickplace.common.files import replaced_file
 from pickplace.rules.cell import CellSpec
 from pickplace.runs.folder import REPORT, changed_values, noted_command
+from pickplace.runs.locate import read_facts
 from pickplace.runs.loggers import read_csv
 from pickplace.training.curriculum.curriculum import Curriculum
 from pickplace.views.figures import failure_mix, played_levels
@@ -21,7 +22,14 @@ from pickplace.views.scene import draw_scene, item_colours
 
 
 def write_report(
-    run_dir: Path, cfg: DictConfig, episodes, cell: CellSpec, facts: dict, curriculum: Curriculum, ended: str
+    run_dir: Path,
+    cfg: DictConfig,
+    best: float,
+    episodes,
+    cell: CellSpec,
+    facts: dict,
+    curriculum: Curriculum,
+    ended: str,
 ) -> None:
     """Write ``report.html``: the fullest tote, curves, tables, the best and the worst episode, and the command that
     repeats the run.
@@ -29,6 +37,7 @@ def write_report(
     Args:
         run_dir: the run folder, with ``metrics.csv`` and ``learning_curve.png``.
         cfg: the composed config.
+        best: occupancy of ``checkpoints/best``, by the settings of now.
         episodes: the last validation, an :class:`pickplace.evaluation.play.Episodes` with recordings.
         cell: the sizes.
         facts: versions and commit.
@@ -40,7 +49,8 @@ def write_report(
     """
     rows, level_name, tote = read_csv(run_dir / "metrics.csv"), curriculum.what, io.BytesIO()
     validations = [row for row in rows if "eval/occupancy" in row]
-    best = max(validations, key=lambda row: row["eval/occupancy"])
+    saved = read_facts(run_dir)
+    after = f", after {saved['frames']:,} frames" if saved else ""
     ordered = sorted(episodes.recordings, key=lambda recording: -recording.occupancy)
     draw_scene(ordered[0], cell, item_colours(ordered[0].boxes)).savefig(tote, dpi=100)
     mix = failure_mix(rows)
@@ -49,7 +59,7 @@ def write_report(
     if changed := changed_values(run_dir, cfg):
         command += f"\n\nChanged when it was resumed: {', '.join(changed)}"
     tiles = [
-        (f"{best['eval/occupancy']:.4f}", f"best validation, after {best['frames']:,} frames (checkpoints/best)"),
+        (f"{best:.4f}", f"best validation{after} (checkpoints/best)"),
         (f"{episodes.occupancy.mean():.4f}", f"last validation, {len(episodes.occupancy)} episodes of the full task"),
         (f"{episodes.occupancy.min():.4f}", "its worst episode"),
         (f"{max(int(row['curriculum/level']) for row in rows)} of {curriculum.end}", f"highest {level_name} reached"),

@@ -51,6 +51,7 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
     Raises:
         KeyboardInterrupt: with the number of the signal that asked to stop; the checkpoint ``last`` is saved.
     """
+    (run_dir / folder.FAILURE).unlink(missing_ok=True)  # left by a failed job of a sweep
     with filtered_consoles(quiet_console) if cfg.get("quiet") else nullcontext():
         return _run(cfg, run_dir, resume)
 
@@ -115,6 +116,5 @@ def resume_run(overrides: list[str]) -> float:
             handlers = (logging.StreamHandler(sys.stdout), logging.FileHandler(run_dir / "train.log"))
             form = "%(asctime)s %(message)s"
             logging.basicConfig(level=logging.INFO, format=form, datefmt="%H:%M:%S", handlers=handlers)
-            (run_dir / folder.FAILURE).unlink(missing_ok=True)  # left by a failed job of a sweep
         log.info("resuming %s at %s frames", run_dir, f"{facts['frames']:,}")
         return run(cfg, run_dir, (state, facts, saved))

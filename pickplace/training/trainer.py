@@ -5,6 +5,7 @@ import shlex
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any, cast
 
@@ -27,11 +28,12 @@ from pickplace.policies.restore import differences
 from pickplace.rules.state import Failure
 from pickplace.runs import checkpoint, folder, provenance
 from pickplace.runs.locate import locate
+from pickplace.runs.loggers import check_metrics, read_csv
 from pickplace.runs.resume import (
     StopRequest,
     checkpoint_config,
     checkpoint_hint,
-    has_config,
+    is_trained_alike,
     is_validated_alike,
     stale_best_frames,
 )
@@ -84,7 +86,7 @@ class Trainer:
         self.frames, self.iteration, self.best, self.latest = ({**NEW, **facts}[key] for key in NEW)
         self.episodes: Episodes | None = None
         # With other settings, a training that a callback had ended goes on.
-        self.ended = facts.get("ended", "") if self.resumed and has_config(facts, self.saved_config) else ""
+        self.ended = facts.get("ended", "") if self.resumed and is_trained_alike(facts, self.saved_config) else ""
         self.callbacks = callbacks.make_callbacks(cfg.get("callbacks") or {}, facts.get("callbacks") or {})
         # The order of these fixes the random draws of a seed.
         self._make_environments()
@@ -92,8 +94,9 @@ class Trainer:
         if self.resumed:
             self.curriculum.load_state_dict(facts["curriculum"])
             self.best = self._best_before(facts)
-        if shortage := self.curriculum.check_budget(cfg.total_frames, self.task.batch_frames):
-            log.warning(shortage)
+        shortage = self.curriculum.check_budget(cfg.total_frames, self.task.batch_frames)
+        for warning in (*self.curriculum.unused_settings(), *([shortage] if shortage else [])):
+            log.warning(warning)
         self.acting = self.algorithm.acting_policy()
         if self.compile != PLAIN:
             self.acting = CompiledPolicy(self.acting, self.compile)
@@ -129,9 +132,13 @@ class Trainer:
         if not self.resumed and (path := cfg.warm_start.weights) is not None:
             weights, facts = checkpoint.read(locate(path, key="warm_start.weights"))
             log.info("beginning with the weights of %s, after %s frames", path, f"{facts['frames']:,}")
-            for group in ("env", "items"):
-                for key, now, before in differences(self.saved_config[group], facts["config"][group], group):
-                    log.info("%s is %s; those weights were trained with %s", key, excerpt(now), excerpt(before))
+            ours, theirs = self.saved_config, facts["config"]
+            pairs = [(group, ours[group], theirs[group]) for group in ("env", "items")]
+            if "critic" in weights:  # it expects discounted, scaled rewards
+                pairs.append(("reward_scale", ours["reward_scale"], theirs["reward_scale"]))
+                pairs.append(("algo.gamma", ours["algo"].get("gamma"), theirs["algo"].get("gamma")))
+            for key, now, before in chain.from_iterable(differences(*pair[1:], pair[0]) for pair in pairs):
+                log.info("%s is %s; those weights were trained with %s", key, excerpt(now), excerpt(before))
         make = partial(build, cell=env.cell)
         make_actor = partial(make, "model.actor", cfg.model.actor, mask_infeasible=cfg.model.mask_infeasible)
         self.policy: Policy = self._restored("policy", make_actor, weights)
@@ -139,7 +146,7 @@ class Trainer:
             log.warning("%s The training goes on all the same.", warning)
         full = self.env.cell
         self.planner = build("planner", cfg.planner, cell=full, policy=self.policy.with_cell(full))
-        self.warm_start = WarmStart(cfg.warm_start, self.policy, env, cfg.seed, cfg.trust)
+        self.warm_start = WarmStart(cfg.warm_start, self.policy, env, cfg.seed, cfg.trust, self.frames)
         self.critic = None
         if isinstance(self.policy, EstimatesValue):
             expect(cfg.model.critic is None, "model.critic", cfg.model.critic, "null; the actor is the critic")
@@ -151,6 +158,7 @@ class Trainer:
         algorithm = build("algo", cfg.algo, policy=self.policy, critic=self.critic, task=self.task)
         expect(isinstance(algorithm, Algorithm), "algo", algorithm, "an algorithm, such as algo=ppo")
         self.algorithm = with_warm_start(algorithm, self.warm_start)
+        checkpoint.check_state(self.algorithm.state_dict(), "algo: its state")  # now, not when it is resumed
         settings.check_memory(cfg, self.env, self.policy, self.algorithm)
 
     def _restored(self, key: str, make, weights: dict) -> Any:
@@ -234,7 +242,7 @@ class Trainer:
             if self.ended:
                 log.info("a callback ended this training at %s frames; other settings continue it", f"{self.frames:,}")
             elif self.is_complete:
-                log.info("this training is complete; a greater total_frames=%s continues it", self.cfg.total_frames)
+                log.info("this training is complete; total_frames above %s continues it", self.frames)
             else:
                 log.info(
                     "%s frames to train, at %s %d of %d",
@@ -263,7 +271,7 @@ class Trainer:
             tell = log.debug if self.curriculum.weights else log.info  # drawn levels change all the time
             tell("%s frames: %s %d -> %d", f"{self.frames:,}", self.curriculum.what, level, self.curriculum.level)
             callbacks.call(self.callbacks, "on_level_change", self, level, self.curriculum.level)
-        learnt = self.algorithm.learn(batch, at)
+        check_metrics("algo", learnt := self.algorithm.learn(batch, at))
         taken = ", ".join(sorted(metrics.keys() & learnt.keys()))
         refuse_if(taken, f"algo: it logs {taken}, which the training logs itself; expected other names.")
         return metrics | learnt
@@ -349,13 +357,15 @@ class Trainer:
             return
         levels = self.curriculum.what, end
         learning_curve(run_dir / "metrics.csv", run_dir / "learning_curve.png", levels, self.ended)
+        # Without a validation, such as after logger=none, there is nothing to report.
+        is_validated = self.best >= 0 and any("eval/occupancy" in row for row in read_csv(run_dir / "metrics.csv"))
         # If this process has no episodes, nothing was trained since the report was written.
-        if self.is_complete and (self.episodes is not None or not (run_dir / folder.REPORT).is_file()):
+        if self.is_complete and is_validated and (self.episodes is not None or not (run_dir / folder.REPORT).is_file()):
             log.info("writing the report")
             occupancy = (self.episodes or self.validate()).occupancy
             replayed = self.validate(record={int(occupancy.argmin()), int(occupancy.argmax())})
             made_with = {**provenance.versions(), "commit": provenance.commit()}
-            write_report(run_dir, self.cfg, replayed, self.env.cell, made_with, self.curriculum, self.ended)
+            write_report(run_dir, self.cfg, self.best, replayed, self.env.cell, made_with, self.curriculum, self.ended)
 
 
 def training_env(base_env, curriculum: Curriculum, how: Compile, first_episode: int, num_envs: int) -> TransformedEnv:

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 import pickplace
 from pickplace.common.errors import full_names, sentence
-from pickplace.config.composition import apply_overrides, compose_plain, conf_dir, known_names
+from pickplace.config.composition import apply_overrides, compose_plain, compose_training, conf_dir, known_names
 from pickplace.config.help import GROUPS
 from pickplace.evaluation import evaluate
 from pickplace.evaluation.evaluate import prepare
@@ -82,7 +82,9 @@ BAD = [
     ("evaluate", "planner=[[1,2],[3]]", ["planner=[[1,2],[3]]"]),
     ("evaluate", "--cfg foo", ["--cfg", "'foo'", "job"]),
     ("train", "env.tote_size=[6,6", ["'env.tote_size=[6,6'", "<key>=<value>"]),
-    ("train", "seed=1,2", ["seed=1,2", "--multirun"]),
+    ("train", "seed=1,2", ["seed=1,2: several values; expected -m for a sweep"]),
+    ("train", "-m hydra.run.dir=x", ["hydra.run.dir=x: this is a sweep; expected hydra.sweep.dir=<folder>."]),
+    ("train", "hydra.sweep.dir=x", ["hydra.sweep.dir=x: this is a run; expected hydra.run.dir=<folder>."]),
     ("train", "curriculum=null", ["curriculum=null", "adaptive", "paper"]),
     ("train", "curriculum.advance=foo", ["curriculum.advance='foo'", "curriculum/advance=<one of frames, "]),
     ("train", "planner=random", ["planner._target_='random'", "expected policy"]),
@@ -134,6 +136,11 @@ BAD_VALUES = [
     ),
     ("train", "collector=multi_sync collector.workers=3", ["collector.workers=3", "divisor"]),
     ("train", "algo=a2c env.num_envs=1 rollout_length=1", ["algo.normalize_advantage=True", "one frame"]),
+    (
+        "train",
+        "algo=sampled_ppo algo.advantages=gae env.num_envs=1 rollout_length=1",
+        ["algo.normalize_advantage=True", "one frame"],
+    ),
     ("evaluate", "planner=joint_dbl evaluation.stream=exam", ["evaluation.stream='exam'", "'validation'"]),
     ("evaluate", "planner=joint_dbl evaluation.latency_decisions=x", ["latency_decisions='x'", ">= 0"]),
     ("train", "threads=10000000000", ["threads=10000000000", "<= 1"]),
@@ -227,6 +234,14 @@ def test_own_values_are_trained_with_and_noted(run, search, monkeypatch, words, 
     assert code == 0, err
     for cfg in (given[0], OmegaConf.load("run/.hydra/config.yaml")):
         assert {key: OmegaConf.select(cfg, key) for key in expected} == expected
+
+
+def test_a_config_is_composed_as_the_command_does(search):
+    cfg = compose_training([search, "experiment=mine", "curriculum/advance=plateau"])
+    assert cfg.curriculum.advance == PLATEAU and cfg.algo.lr == 0.5 and "hydra" not in cfg
+    for words, message in (("seed=0,1", "several values"), ("+evaluation.foo=1", "no key 'foo'"), ("foo=1", "'foo'")):
+        with pytest.raises(ValueError, match=message):
+            compose_training([words])
 
 
 def test_own_values_in_a_sweep(run, search, monkeypatch):

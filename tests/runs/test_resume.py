@@ -171,6 +171,7 @@ def test_a_job_of_a_sweep_that_is_started_again_goes_on(undisturbed, tmp_path, c
     caplog.set_level(logging.INFO)
     whole, killed = undisturbed("single")
     job, cfg = shutil.copytree(killed, tmp_path / "seed-0"), composed(*SETTINGS, "collector=single")
+    note_failure(job, ValueError("a worker has died"))  # else the sweep's table would call it failed for ever
     train(cfg, job)
     assert f"going on with {job} at {3 * ITERATION} frames" in caplog.text
     assert_same(whole, job)
@@ -203,14 +204,23 @@ def test_a_stop_request_ends_a_sweep(run, tmp_path, no_report):
     assert saved_frames(tmp_path / "sweep" / "seed-0") == 128 and not (tmp_path / "sweep" / "seed-1").exists()
 
 
-def test_a_missing_report_is_written_on_resume(smoke_run, tmp_path):
+def test_a_missing_report_is_written_on_resume(smoke_run, tmp_path, caplog):
+    """With the best by the settings of now, which may be of other episodes; but not without a validation."""
     run_dir = shutil.copytree(smoke_run, tmp_path / "run")
+    state, facts = checkpoint.read(last := run_dir / "checkpoints/last")
+    checkpoint.write(last, state, {**facts, "best": 0.1234})
     (run_dir / ".hydra").mkdir()
     OmegaConf.save(composed("experiment=smoke", "threads=1", "evaluation_interval=512"), run_dir / ".hydra/config.yaml")
     (run_dir / "report.html").unlink()
     resume_run([f"resume={run_dir}", "algo.epochs=3"])
     text = html.unescape((run_dir / "report.html").read_text())
     assert "\n\nChanged when it was resumed: algo.epochs=3</pre>" in text
+    assert "<b>0.1234</b><span>best validation, after 512 frames (checkpoints/best)" in text
+    (run_dir / "report.html").unlink()
+    (run_dir / "metrics.csv").unlink()  # as after logger=none
+    caplog.set_level(logging.INFO)
+    resume_run([f"resume={run_dir}"])
+    assert not (run_dir / "report.html").exists() and "complete; total_frames above 512 continues it" in caplog.text
 
 
 @pytest.mark.parametrize("changed", [["algo.lr=0"], []])
@@ -244,7 +254,10 @@ def test_a_best_is_compared_on_the_episodes_of_now(smoke_run, tmp_path, no_repor
     def resumed(*words):
         return Trainer(resumed_config("x", facts, [*words]), run_dir, (state, {**facts, "best": 0.99}, saved / "last"))
 
-    assert resumed("evaluation_interval=1").best == 0.99
+    imitated = "warm_start.frames=512"  # that is over: the teacher, which is missing, is not asked
+    assert resumed("evaluation_interval=1", imitated).best == 0.99
+    with pytest.raises(ValueError, match="warm_start.frames=513: expected 0 without a teacher"):
+        resumed("warm_start.frames=513")
     trainer = resumed("evaluation.episodes=3")
     for key, value in trainer.policy.state_dict().items():
         assert torch.equal(value, state["policy"][key]), key

@@ -15,7 +15,7 @@ from pickplace.items.distributions import Kinds
 from pickplace.training.curriculum.advance import Advance, Frames, NoAdvance, Plateau, Staged, Threshold
 from pickplace.training.curriculum.curriculum import Curriculum
 from pickplace.training.curriculum.learning_progress import LearningProgress
-from pickplace.training.curriculum.sample import Current
+from pickplace.training.curriculum.sample import Current, Recent, Uniform
 from pickplace.training.curriculum.transform import ToteHeightCurriculum
 
 
@@ -219,6 +219,11 @@ ERRORS = [
     (lambda: Staged([{"frames": 1}]), r"curriculum.advance.stages=\[{'frames': 1}\]: "),
     (lambda: Staged([STAGE] * 2), "curriculum.advance.stages: frames=5: .* >= 6"),
     (lambda: make(Staged([STAGE | {"height": 9}])), "curriculum.advance.stages: level=9: .* <= 5"),
+    (
+        lambda: Curriculum(Staged([STAGE]), Current(), levels=[{}]),
+        "curriculum.advance.stages: height: expected level, a number, where curriculum.levels lists",
+    ),
+    (lambda: Recent(1.0), "curriculum.sample.share=1.0: expected a number below 1"),
     # States of another run; for damaged ones see test_resume.
     (lambda: make(Frames(1)).load_state_dict(make(Plateau(2, 2)).state_dict()), "advance='Frames': expected .*'best'"),
     (
@@ -281,15 +286,28 @@ def test_a_budget_is_refused_if_the_last_height_is_not_reached(batch, rule, occu
 def test_budgets_without_a_last_height():
     assert make(Frames(), total_frames=1000).check_budget(1000) is None  # even shares always fit
     assert "a stage of that level" in make(Staged([{"frames": 5, "height": 3}])).check_budget(10**9)
+    assert "expected more than 300 frames" in make(Staged(STAGES)).check_budget(300, batch=100)  # it rises after them
+    assert make(Staged(STAGES)).check_budget(301, batch=100) is None
     lower = make(NoAdvance(), end_height=3).check_budget(1000)
     assert "curriculum.end_height=3: the last level is not the full task, which validation" in lower
+
+
+def test_settings_that_decide_nothing_are_named():
+    levels = [{"tote_height": 2}, {}]
+    (ignored,) = make(NoAdvance(), levels=levels).unused_settings()
+    assert ignored == "curriculum.levels: NoAdvance plays the last level only; expected another curriculum/advance."
+    (ignored,) = make(LearningProgress(), Uniform()).unused_settings()
+    assert ignored.startswith("curriculum.sample: Uniform is not used while the weights of LearningProgress draw")
+    for used in (make(NoAdvance(), Uniform(), levels=levels), make(Frames(9), levels=levels), make(LearningProgress())):
+        assert used.unused_settings() == []
 
 
 # --- weights
 
 
-def test_weights_of_a_users_rule_may_be_whole_numbers():
-    curriculum = make(Weighted(0, 1, 0, 3, 0))
+@pytest.mark.parametrize("scale", [1, 1e300, 1e-300])
+def test_weights_of_a_users_rule_may_be_any_numbers(scale):
+    curriculum = make(Weighted(0, scale, 0, 3 * scale, 0))
     drawn = ToteHeightCurriculum(1, Current(), curriculum.levels, curriculum.weights)._draw(100)
     assert drawn.unique().tolist() == [2, 4]
 

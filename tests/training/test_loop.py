@@ -263,13 +263,16 @@ def test_a_training_may_begin_with_the_weights_of_another_one(tmp_path, caplog):
     """For another tote, which is said; a critic that is not among the weights, or does not fit, begins anew."""
     caplog.set_level("INFO")
     words = ["threads=1", "env.num_envs=8", "algo.minibatch_size=16", "env.tote_size=[6,5,2]", "total_frames=64"]
-    begun = Trainer(composed(*words, "warm_start.weights=pretrained/r4"), tmp_path)
+    changed = ["algo.gamma=0.5", "reward_scale=1", "curriculum=none", "curriculum.levels=[{tote_height: 1}, {}]"]
+    begun = Trainer(composed(*words, *changed, "warm_start.weights=pretrained/r4"), tmp_path)
     state, _ = checkpoint.read(locate("pretrained/r4"))
     for key, module in (("policy", begun.policy), ("critic", begun.critic)):
         assert module.state_dict().keys() == state[key].keys()
         assert all(torch.equal(value, state[key][name]) for name, value in module.state_dict().items())
     assert begun.frames == 0 and not begun.resumed
     assert "env.tote_size is [6, 5, 2]; those weights were trained with [6, 6, 5]" in caplog.messages
+    for message in ("algo.gamma is 0.5; those", "reward_scale is 1; those", "curriculum.levels: NoAdvance plays"):
+        assert message in caplog.text  # values of the critic; and levels that are never played
     bare = Trainer(composed(*words, "model=fcn4d", "warm_start.weights=pretrained/fcn4d"), tmp_path)
     assert "critic" not in checkpoint.read(locate("pretrained/fcn4d"))[0]
     assert bare.critic.module.value[0].in_features == 64 * (25 + 30) + 2

@@ -49,11 +49,13 @@ class Advance:
         window: number of latest episodes at the level that the tally keeps.
         state_keys: names of the attributes that are the rule's own state, saved in checkpoints; after :meth:`setup`
             each is a value that JSON holds, with finite numbers.
+        heights_key: the setting that names levels by the tote's height, which a list of levels refuses; empty: none.
         start, end: the first and the last level, set by :meth:`setup`.
     """
 
     window = 100
     state_keys: tuple[str, ...] = ()
+    heights_key = ""
 
     def setup(self, start: int, end: int, total_frames: int) -> int:
         """Store the first and the last level and use the run's budget in frames; return the level to begin with."""
@@ -214,6 +216,8 @@ class Staged(Advance):
             stages,
             "a list of {frames: F, level: L}; what a level sets stands in curriculum.levels",
         )
+        if any("height" in stage for stage in stages):
+            self.heights_key = "curriculum.advance.stages: height"
         self.stages: dict[int, int | None] = {}  # levels by first frame
         for stage in stages:
             least = max(self.stages, default=-1) + 1
@@ -233,4 +237,5 @@ class Staged(Advance):
         return self._level_at(tally.frames), {}
 
     def least_frames(self, batch):
-        return min((f for f in (0, *self.plan) if self._level_at(f) == self.end), default=math.inf)
+        first = min((f for f in (0, *self.plan) if self._level_at(f) == self.end), default=math.inf)
+        return first if first == math.inf else -(-first // batch) * batch

@@ -8,11 +8,12 @@ from numbers import Real
 
 from torch import Tensor
 
-from pickplace.common.validate import expect, integral_number, is_number, is_whole, number
+from pickplace.common.validate import expect, integral_number, is_number, is_whole, number, refuse_if
 from pickplace.items.distributions import ItemDistribution
 from pickplace.rules.cell import CellSpec
-from pickplace.training.curriculum.advance import Advance, Tally
+from pickplace.training.curriculum.advance import Advance, NoAdvance, Tally
 from pickplace.training.curriculum.levels import heights, read_levels
+from pickplace.training.curriculum.sample import Current
 
 
 class Curriculum:
@@ -47,6 +48,10 @@ class Curriculum:
         if levels is not None:
             for key, height in (("start_height", start_height), ("end_height", end_height)):
                 expect(height is None, f"curriculum.{key}", height, "null where curriculum.levels lists the levels")
+            refuse_if(
+                advance.heights_key,
+                f"{advance.heights_key}: expected level, a number, where curriculum.levels lists the levels.",
+            )
 
     def setup(self, cell: CellSpec, items: ItemDistribution, total_frames: int) -> None:
         """Set the levels and the budget of a run, and begin at the first level.
@@ -92,6 +97,20 @@ class Curriculum:
             good, f"{self._rule}: its weights", weights, f"{count} numbers >= 0 that are not all 0, or none, in a list"
         )
         return [float(weight) for weight in weights]
+
+    def unused_settings(self) -> list[str]:
+        """Return a warning for each setting that decides nothing."""
+        rule, sampler = type(self.advance).__name__, type(self.sample).__name__
+        if self.weights and not isinstance(self.sample, Current):
+            return [f"curriculum.sample: {sampler} is not used while the weights of {rule} draw the levels."]
+        if (
+            self.given
+            and len(self.given) > 1
+            and isinstance(self.advance, NoAdvance)
+            and isinstance(self.sample, Current)
+        ):
+            return [f"curriculum.levels: {rule} plays the last level only; expected another curriculum/advance."]
+        return []
 
     def check_budget(self, total_frames: int, batch: int = 1) -> str | None:
         """Return a warning if the full task cannot be trained within ``total_frames``, else None.

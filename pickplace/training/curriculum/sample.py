@@ -7,7 +7,7 @@ int64 ``[count]``. Levels that differ in the tote's height alone are numbered by
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import number
+from pickplace.common.validate import expect, number
 
 
 class Current:
@@ -28,11 +28,12 @@ class Recent:
     """Sampler: the level reached, and a share of episodes at earlier levels to prevent forgetting.
 
     Args:
-        share: probability in [0, 1] of an earlier level, drawn uniformly from torch's global generator.
+        share: probability in [0, 1) of an earlier level, drawn uniformly from torch's global generator.
     """
 
     def __init__(self, share: float = 0.25):
-        self.share = number("curriculum.sample.share", share, most=1)
+        key = "curriculum.sample.share"
+        self.share = expect(number(key, share, most=1) < 1, key, share, "a number below 1")
 
     def __call__(self, level: int, first: int, count: int) -> Tensor:
         earlier = torch.randint(first, max(level, first + 1), (count,))

@@ -27,14 +27,14 @@ class ToteHeightCurriculum(Transform):
 
     def __init__(self, level: int, sampler, levels: Levels, weights: Sequence[float] = ()):
         super().__init__()
-        self.sampler, self.levels, self.weights = sampler, levels, torch.tensor([*weights])
+        self.sampler, self.levels, self.weights = sampler, levels, _relative(weights)
         # A buffer, so that it is in state_dict() and follows the environment to its device.
         self.register_buffer("level", torch.tensor(integral_number("level", level, levels.first)))
 
     def set_level(self, level: int, weights: Sequence[float] = ()) -> None:
         """Draw the levels of later episodes at this level, or by these weights."""
         self.level.fill_(integral_number("level", level, self.levels.first))
-        self.weights = torch.tensor([*weights])
+        self.weights = _relative(weights)
 
     def _draw(self, count: int) -> Tensor:
         """Return level numbers of new episodes, int64 ``[count]``."""
@@ -63,6 +63,12 @@ class ToteHeightCurriculum(Transform):
                 value = torch.where(reset.reshape(*tensordict.batch_size, 1), value, running)
             tensordict = tensordict.set(key, value)
         return tensordict
+
+
+def _relative(weights: Sequence[float]) -> Tensor:
+    """Return weights as shares of the greatest one: torch draws by no sum that is infinite."""
+    shares = torch.tensor([*weights], dtype=torch.float64)
+    return shares / shares.max() if len(shares) else shares
 
 
 def push_level(collector, level: int, weights: Sequence[float] = ()) -> None:
