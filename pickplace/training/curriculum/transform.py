@@ -68,7 +68,7 @@ class ToteHeightCurriculum(Transform):
 def _relative(weights: Sequence[float]) -> Tensor:
     """Return weights as shares of the greatest one: torch draws by no sum that is infinite."""
     shares = torch.tensor([*weights], dtype=torch.float64)
-    return shares / shares.max() if len(shares) else shares
+    return (shares / shares.max()).float() if len(shares) else shares
 
 
 def push_level(collector, level: int, weights: Sequence[float] = ()) -> None:
