@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import refuse_any, refuse_if, reworded
+from pickplace.common.validate import refuse_any, refuse_if, reworded, whole_number
 from pickplace.config.registry import find
 from pickplace.items.order_file import ORIENTATIONS, TURNS, OrderItem
 from pickplace.planners.base import MapPlanner
-from pickplace.rules.cell import MAX_SIDE, CellSpec
+from pickplace.rules.cell import MAX_CELLS, MAX_SIDE, CellSpec
 from pickplace.rules.gripper.rules import Overlap
 from pickplace.rules.item import NO_LIMIT, Item
 from pickplace.rules.maps import NEVER
@@ -29,6 +29,7 @@ Numbered: TypeAlias = list[tuple[int, OrderItem]]  # items with their numbers in
 Faces: TypeAlias = Sequence[tuple[str, str]]  # the orientations of each face, as it lies and turned by 90 degrees
 Variant: TypeAlias = tuple[tuple[str, str], list[int]]  # an item on one of its faces, as a row of a table of items
 
+MAX_CELL = 1_000  # side of a cell, mm: heights are in mm, and a cell has at most 1,000 height units
 LEAST_MARGIN = 20.0  # of an item's centre from the edge of its support, mm; large, as piles are high
 
 #: Orientations of an item on each face on which it may lie, as it lies and turned by 90 degrees; first the upright one.
@@ -81,6 +82,12 @@ class PackedContainer:
         return max((packed.corner[2] + packed.size[2] for packed in self.items), default=0.0)
 
 
+class PackingCell(CellSpec):
+    """A cell whose bin is made up for the items, without a limit on the flat actions: packing lists none of them."""
+
+    max_actions = 2 * MAX_CELLS**2
+
+
 class OrderPacker:
     """Packs orders into containers of one size, without a gripper.
 
@@ -90,7 +97,7 @@ class OrderPacker:
 
     Args:
         container: length, width and height, mm.
-        cell: side of a cell of the grid, mm.
+        cell: side of a cell of the grid, mm, at most :data:`MAX_CELL`.
         planner: name of the planner that chooses places, such as ``"joint_dbl"``; it must need no training.
         tipping: whether to put items down on another side, too, if they allow it.
 
@@ -105,6 +112,7 @@ class OrderPacker:
         planner: str = "heightmap_minimisation",
         tipping: bool = False,
     ):
+        whole_number("cell", cell, most=MAX_CELL)
         self._faces = FACES if tipping else FACES[:1]
         self.container, self.cell_mm, size = container, cell, "x".join(map(str, container))
         refuse_any(
@@ -133,9 +141,8 @@ class OrderPacker:
             keep_sequence: whether to keep the order's sequence, instead of the best of :data:`SEQUENCES`.
 
         Raises:
-            ValueError: for an item that fits into no container, naming its place in the file.
+            ValueError: as of :meth:`check`.
         """
-        self.check(items)
         cell = self._cell_for(items)
         planner, left = self._make(cell), list(enumerate(items, 1))
         containers: list[PackedContainer] = []
@@ -154,8 +161,11 @@ class OrderPacker:
         return replace(cell, bin_size=(cell.bin_size[0] // cell.bin_items, *cell.bin_size[1:]), bin_items=1), containers
 
     def check(self, items: Sequence[OrderItem]) -> None:
-        """Refuse an item that fits into no container, with a ``ValueError`` that names its place in the file."""
-        refuse_any((item for item in items if not self._variants(item, self._faces)), self._misfit)
+        """Raise ``ValueError`` for items that cannot be packed.
+
+        The message names the place in the file of an item that fits into no container, or the cell if it is too fine.
+        """
+        self._make(self._cell_for(items))
 
     def _variants(self, item: OrderItem, faces: Faces) -> list[Variant]:
         """Return the faces on which an item may lie in the container, each with the columns ``w`` to ``max_load`` of an
@@ -189,12 +199,13 @@ class OrderPacker:
         )
 
     def _cell_for(self, items: Sequence[OrderItem]) -> CellSpec:
+        refuse_any((item for item in items if not self._variants(item, self._faces)), self._misfit)
         sides = [columns[:3] for item in items for _, columns in self._variants(item, self._faces)]
         wide, deep, high = (max(part) for part in zip(*sides, strict=True))
         length, width = (side // self.cell_mm for side in self.container[:2])
         bins = (len(self._faces) * wide, deep, high)  # an item on each of its faces, side by side
         with reworded(ValueError, lambda error: ValueError(f"cell={self.cell_mm} mm is too fine: {error}")):
-            cell = CellSpec(bin_size=bins, tote_size=(length, width, self.container[2]), **self._settings)
+            cell = PackingCell(bin_size=bins, tote_size=(length, width, self.container[2]), **self._settings)
         handling = any(item.has_limits for item in items)
         return replace(
             cell, bin_items=len(self._faces), longest_side=max(wide, deep), handling=handling, most_items=len(items)

@@ -4,6 +4,7 @@ import csv
 import json
 import math
 import random
+import shutil
 import sys
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from omegaconf import OmegaConf
 from scipy.spatial import ConvexHull
 
 from pickplace import cli
+from pickplace.common.validate import refuse_if
 from pickplace.evaluation.pack import OrderPacker
 from pickplace.items.order_file import ORIENTATIONS, OrderItem
 from pickplace.physics.engine import build_engine
@@ -176,12 +178,71 @@ def test_tops_that_are_rounded_alike_are_not_level():
 
 
 def test_tiny_items_and_orders_of_one_name_end(pack, tmp_path):
+    """Orders keep apart, with one name in both files: those that differ by a control character, or clash with another
+    one's second container or with the file's name."""
     (path := tmp_path / "a.csv").write_text(
         "order,l,w,h,kg\n7,300,200,200,1\n7,300,200,200,1\n7#2,60,50,20,1\n8,1e-7,50,20,1e-9\n8\x1b[31m,50,50,50,1\n"
+        "8\x1c[31m,50,50,50,1\n,50,50,50,1\na,50,50,50,1\n"
     )
     folder, out = pack(path, "--container", "300x200x200")
-    assert [*json.loads((folder / "plan.json").read_text())] == ["7", "7#2", "7#2'", "8", "8?[31m"]
+    names = ["7", "7#2'", "8", "8?[31m", "8?[31m'", "a", "a'"]
+    assert [*json.loads((folder / "plan.json").read_text())] == ["7", "7#2", *names[1:]]
+    with (folder / "plan.csv").open() as file:
+        assert [*dict.fromkeys(row["order"] for row in csv.DictReader(file))] == names
     assert "\x1b" not in out
+
+
+def test_a_plan_of_bed_bpp_is_what_its_code_reads(pack, tmp_path):
+    """Whole millimetres, the names of the input, and two orientations: a tipped item has the sides as it lies."""
+    names = {"article": "tea-7", "id": "7", "product_group": "tea"}
+    box = {**names, "length/mm": 200, "width/mm": 100, "height/mm": 60, "weight/kg": 1.5, "sequence": 1}
+    (path := tmp_path / "a.json").write_text(json.dumps({"a": {"item_sequence": {str(n): box for n in range(1, 4)}}}))
+    folder, _ = pack(path, "--container", "200x180x100", "--tipping")
+    with (folder / "plan.csv").open() as file:
+        rows = [*csv.DictReader(file)]
+    actions = [action for each in json.loads((folder / "plan.json").read_text()).values() for action in each]
+    assert {*names.items()} <= {*actions[0]["item"].items()}
+    assert {row["orientation"] for row in rows} & {*ORIENTATIONS[2:]}
+    for row, action in zip(rows, actions, strict=True):
+        sides = [action["item"][key] for key in ("length/mm", "width/mm", "height/mm")]
+        assert {*map(type, [*sides, *action["flb_coordinates"]])} == {int}
+        if action["orientation"]:
+            sides[:2] = sides[1::-1]
+        assert sides == [float(row[key]) for key in ("along_x/mm", "along_y/mm", "height/mm")]
+        assert action["orientation"] in (0, 1)
+
+
+def test_all_orders_are_packed_before_the_first_file_and_old_pages_go(pack, tmp_path, monkeypatch):
+    (path := tmp_path / "a.csv").write_text("order,l,w,h,kg\n1,50,50,50,1\n2,50,50,50,1\n")
+    folder, _ = pack(path, "--container", "100x100x100")
+    for name in ("replay.html", "replay_3.html", "replay_03.html"):
+        (folder / name).write_text("old")
+    pack(path, "--container", "100x100x100")
+    left = {file.name for file in folder.iterdir()} - {"plan.csv", "plan.json", "plans.jsonl"}
+    assert left == {"replay_1.html", "replay_2.html", "replay_03.html"}
+    shutil.rmtree(folder)
+    packed = OrderPacker.pack
+
+    def fail(self, items, keep):
+        refuse_if(items[0].place.endswith("line 3"), "late")
+        return packed(self, items, keep)
+
+    monkeypatch.setattr(OrderPacker, "pack", fail)
+    pack(path, "--container", "100x100x100", code=2)
+    assert not folder.exists()
+
+
+def test_an_order_is_checked_for_a_cell_that_is_too_fine():
+    item = OrderItem("sheet", 2000.0, 1000.0, 5.0, 9, "line 1")
+    with pytest.raises(ValueError, match="^cell=5 mm is too fine: bin_size="):
+        OrderPacker((2000, 1000, 250), 5).check([item])
+
+
+def test_a_sheet_as_large_as_the_container():
+    """Its bin has as many cells as the container: their product says nothing about packing."""
+    items = [OrderItem("sheet", 1200.0, 800.0, 5.0, 9, "line 1")] * 2
+    _, (one,) = OrderPacker((1200, 800, 100), 10).pack(items, keep_sequence=True)
+    assert len(one.items) == 2
 
 
 @pytest.fixture
@@ -236,6 +297,7 @@ def test_a_second_container_takes_what_is_left(pack, tmp_path):
         (["--container", "0x300x250"], "--container=0x300x250: expected sides of 1 mm or more."),
         (["--container", "400x300"], "--container=400x300: expected whole millimetres, such as 1200x800x1500."),
         (["--container", "400x300x250", "--cell", "7"], "container=400x300x250: expected a length and a width that"),
+        (["--container", "4000x4000x250", "--cell", "2000"], "cell=2000: expected a whole number >= 1 and <= 1,000."),
         (["--container", "100x100x250"], "orders.csv, line 4: 140 x 90 x 45 mm; expected an item that fits the"),
         (["--container", "400x300x250", "--planner", "policy"], "planner=policy: expected one that needs no training"),
         (["--container", "400x300x250", "--planner", "jointdbl"], "did you mean 'joint_dbl'?"),
