@@ -30,7 +30,8 @@ Faces: TypeAlias = Sequence[tuple[str, str]]  # the orientations of each face, a
 Variant: TypeAlias = tuple[tuple[str, str], list[int]]  # an item on one of its faces, as a row of a table of items
 
 MAX_CELL = 1_000  # side of a cell, mm: heights are in mm, and a cell has at most 1,000 height units
-LEAST_MARGIN = 20.0  # of an item's centre from the edge of its support, mm; large, as piles are high
+LEAST_MARGIN = 10.0  # of an item's centre from the edge of its support, mm
+CELL_MARGIN = 20.0  # the same for the cells that it takes, mm; large, as piles are high
 
 #: Orientations of an item on each face on which it may lie, as it lies and turned by 90 degrees; first the upright one.
 FACES = tuple(zip(ORIENTATIONS[::2], ORIENTATIONS[1::2], strict=True))
@@ -92,7 +93,9 @@ class OrderPacker:
     """Packs orders into containers of one size, without a gripper.
 
     Within its cells, an item lies in the corner with the least x and y. Items that carry another one together
-    are level within a millimetre. Nothing sticks out of the container, or passes its rim. An item is turned only as it
+    are level within a millimetre. By the items' true sides, all four corners of an item lie in the hull of its support,
+    or its centre does, :data:`LEAST_MARGIN` from the edge; only what lies in the hull of its own support carries
+    others, down to the floor. Nothing sticks out of the container, or passes its rim. An item is turned only as it
     allows, and no item carries more than it bears: the full mass of an item counts on each one below it in the pile.
 
     Args:
@@ -125,7 +128,6 @@ class OrderPacker:
         )
         self._settings: dict[str, Any] = {
             "gripper": Overlap(size=(1, 1)), "rotations": 2, "height_unit": 1 / cell, "cell_size": cell / 1000,
-            "support": RoundedUp(max(0.75, LEAST_MARGIN / cell)),
         }  # fmt: skip
         self._make, self._name = find("planner", planner), planner
         refuse_if(
@@ -200,12 +202,21 @@ class OrderPacker:
 
     def _cell_for(self, items: Sequence[OrderItem]) -> CellSpec:
         refuse_any((item for item in items if not self._variants(item, self._faces)), self._misfit)
-        sides = [columns[:3] for item in items for _, columns in self._variants(item, self._faces)]
+        variants = [(item, *each) for item in items for each in self._variants(item, self._faces)]
+        sides = [columns[:3] for _, _, columns in variants]
+        # The true centre and the true edges are off those of an item's cells; this is the greatest loss of distance.
+        lost = max(
+            math.dist([side * self.cell_mm for side in columns[:2]], _oriented(item, face[0])[:2]) / 2
+            for item, face, columns in variants
+        )
         wide, deep, high = (max(part) for part in zip(*sides, strict=True))
         length, width = (side // self.cell_mm for side in self.container[:2])
         bins = (len(self._faces) * wide, deep, high)  # an item on each of its faces, side by side
         with reworded(ValueError, lambda error: ValueError(f"cell={self.cell_mm} mm is too fine: {error}")):
-            cell = PackingCell(bin_size=bins, tote_size=(length, width, self.container[2]), **self._settings)
+            support = RoundedUp(max(CELL_MARGIN, LEAST_MARGIN + lost) / self.cell_mm)
+            cell = PackingCell(
+                support=support, bin_size=bins, tote_size=(length, width, self.container[2]), **self._settings
+            )
         handling = any(item.has_limits for item in items)
         return replace(
             cell, bin_items=len(self._faces), longest_side=max(wide, deep), handling=handling, most_items=len(items)
@@ -265,9 +276,15 @@ class OrderPacker:
         fill.tops[x : x + w, y : y + d] = below + packed.size[2]
         # A top is rounded up once, not with each item of its pile: so level tops are level within a millimetre.
         heights[x : x + w, y : y + d] = math.ceil(below + packed.size[2] - 1e-6)
-        for axis, count in enumerate((w, d)):
-            if packed.size[axis] < count * self.cell_mm - 1e-6:  # it does not fill its last cells
-                bearing[x : x + w, y : y + d].select(axis, count - 1).fill_(False)
+        # Where it does not fill its last cells, they bear nothing. If some of these support it, the hull of the support
+        # ends inside them: then a cell is in the true hull if it and the next one are in that of the cells.
+        part = bearing[x : x + w, y : y + d]
+        unfilled = [axis for axis, count in enumerate((w, d)) if packed.size[axis] < count * self.cell_mm - 1e-6]
+        for axis in [axis for axis in unfilled if part.select(axis, part.shape[axis] - 1).any()]:
+            count = part.shape[axis] - 1
+            part.narrow(axis, 0, count).logical_and_(part.narrow(axis, 1, count).clone())
+        for axis in unfilled:
+            part.select(axis, part.shape[axis] - 1).fill_(False)
 
     def _closed(self, fill: "_Filling") -> tuple[PackedContainer, Numbered]:
         """Return a container that gets no more items, and those that found no place in it."""
