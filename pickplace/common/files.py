@@ -4,6 +4,7 @@ import csv
 import io
 import os
 import stat
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -53,6 +54,28 @@ def _bad_byte(error: UnicodeDecodeError) -> str:
     return f"line {line}: got the byte 0x{error.object[error.start]:02x}"
 
 
+def csv_rows(path, text: str, separator: str = ",") -> Iterator[tuple[int, list[str]]]:
+    """Yield the rows of a CSV text: the number of the line where the row begins, and its fields without white space.
+
+    Args:
+        path: the file, for messages.
+        text: its content.
+        separator: of the fields.
+
+    Raises:
+        ValueError: naming the file and the line, for example for a quote that is never closed.
+    """
+    reader, line = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True), 1
+
+    def refusal(error: csv.Error) -> ValueError:
+        return ValueError(f"{path}, line {line}: {error}; expected a CSV in UTF-8, each quote closed in its field.")
+
+    with reworded(csv.Error, refusal):
+        for row in reader:
+            yield line, [field.strip() for field in row]
+            line = reader.line_num + 1
+
+
 def read_table(key: str, path, *headers: str) -> tuple[str, list[tuple[int, list[str]]]]:
     """Return the header of a CSV file, and for each other row its line number and its fields, without white space.
 
@@ -68,9 +91,7 @@ def read_table(key: str, path, *headers: str) -> tuple[str, list[tuple[int, list
         not Path(path).exists(),
         f"{key}={str(path)!r}: no such file; expected a CSV with columns {' or '.join(headers)}.",
     )
-    with reworded(csv.Error, lambda error: ValueError(f"{path}: {error}; expected a CSV in UTF-8.")):
-        reader = csv.reader(io.StringIO(read_text(path, MAX_TABLE_BYTES, "utf-8-sig", empty=False), newline=""))
-        table = [(reader.line_num, [field.strip() for field in row]) for row in reader]
+    table = [*csv_rows(path, read_text(path, MAX_TABLE_BYTES, "utf-8-sig", empty=False))]
     header = ",".join(table[0][1]) if table else ""
     rows = [(line, fields) for line, fields in table[1:] if any(fields)]
     refuse_if(

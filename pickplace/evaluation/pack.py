@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import refuse_any, refuse_if, reworded
+from pickplace.common.validate import refuse_any, refuse_if, reworded, whole_number
 from pickplace.config.registry import find
 from pickplace.items.order_file import ORIENTATIONS, TURNS, OrderItem
 from pickplace.planners.base import MapPlanner
-from pickplace.rules.cell import MAX_SIDE, CellSpec
+from pickplace.rules.cell import MAX_CELLS, MAX_SIDE, CellSpec
 from pickplace.rules.gripper.rules import Overlap
 from pickplace.rules.item import NO_LIMIT, Item
 from pickplace.rules.maps import NEVER
@@ -29,7 +29,9 @@ Numbered: TypeAlias = list[tuple[int, OrderItem]]  # items with their numbers in
 Faces: TypeAlias = Sequence[tuple[str, str]]  # the orientations of each face, as it lies and turned by 90 degrees
 Variant: TypeAlias = tuple[tuple[str, str], list[int]]  # an item on one of its faces, as a row of a table of items
 
-LEAST_MARGIN = 20.0  # of an item's centre from the edge of its support, mm; large, as piles are high
+MAX_CELL = 1_000  # side of a cell, mm: heights are in mm, and a cell has at most 1,000 height units
+LEAST_MARGIN = 10.0  # of an item's centre from the edge of its support, mm
+CELL_MARGIN = 20.0  # the same for the cells that it takes, mm; large, as piles are high
 
 #: Orientations of an item on each face on which it may lie, as it lies and turned by 90 degrees; first the upright one.
 FACES = tuple(zip(ORIENTATIONS[::2], ORIENTATIONS[1::2], strict=True))
@@ -81,16 +83,24 @@ class PackedContainer:
         return max((packed.corner[2] + packed.size[2] for packed in self.items), default=0.0)
 
 
+class PackingCell(CellSpec):
+    """A cell whose bin is made up for the items, without a limit on the flat actions: packing lists none of them."""
+
+    max_actions = 2 * MAX_CELLS**2
+
+
 class OrderPacker:
     """Packs orders into containers of one size, without a gripper.
 
     Within its cells, an item lies in the corner with the least x and y. Items that carry another one together
-    are level within a millimetre. Nothing sticks out of the container, or passes its rim. An item is turned only as it
+    are level within a millimetre. By the items' true sides, all four corners of an item lie in the hull of its support,
+    or its centre does, :data:`LEAST_MARGIN` from the edge; only what lies in the hull of its own support carries
+    others, down to the floor. Nothing sticks out of the container, or passes its rim. An item is turned only as it
     allows, and no item carries more than it bears: the full mass of an item counts on each one below it in the pile.
 
     Args:
         container: length, width and height, mm.
-        cell: side of a cell of the grid, mm.
+        cell: side of a cell of the grid, mm, at most :data:`MAX_CELL`.
         planner: name of the planner that chooses places, such as ``"joint_dbl"``; it must need no training.
         tipping: whether to put items down on another side, too, if they allow it.
 
@@ -105,6 +115,7 @@ class OrderPacker:
         planner: str = "heightmap_minimisation",
         tipping: bool = False,
     ):
+        whole_number("cell", cell, most=MAX_CELL)
         self._faces = FACES if tipping else FACES[:1]
         self.container, self.cell_mm, size = container, cell, "x".join(map(str, container))
         refuse_any(
@@ -117,7 +128,6 @@ class OrderPacker:
         )
         self._settings: dict[str, Any] = {
             "gripper": Overlap(size=(1, 1)), "rotations": 2, "height_unit": 1 / cell, "cell_size": cell / 1000,
-            "support": RoundedUp(max(0.75, LEAST_MARGIN / cell)),
         }  # fmt: skip
         self._make, self._name = find("planner", planner), planner
         refuse_if(
@@ -133,9 +143,8 @@ class OrderPacker:
             keep_sequence: whether to keep the order's sequence, instead of the best of :data:`SEQUENCES`.
 
         Raises:
-            ValueError: for an item that fits into no container, naming its place in the file.
+            ValueError: as of :meth:`check`.
         """
-        self.check(items)
         cell = self._cell_for(items)
         planner, left = self._make(cell), list(enumerate(items, 1))
         containers: list[PackedContainer] = []
@@ -154,8 +163,11 @@ class OrderPacker:
         return replace(cell, bin_size=(cell.bin_size[0] // cell.bin_items, *cell.bin_size[1:]), bin_items=1), containers
 
     def check(self, items: Sequence[OrderItem]) -> None:
-        """Refuse an item that fits into no container, with a ``ValueError`` that names its place in the file."""
-        refuse_any((item for item in items if not self._variants(item, self._faces)), self._misfit)
+        """Raise ``ValueError`` for items that cannot be packed.
+
+        The message names the place in the file of an item that fits into no container, or the cell if it is too fine.
+        """
+        self._make(self._cell_for(items))
 
     def _variants(self, item: OrderItem, faces: Faces) -> list[Variant]:
         """Return the faces on which an item may lie in the container, each with the columns ``w`` to ``max_load`` of an
@@ -189,12 +201,22 @@ class OrderPacker:
         )
 
     def _cell_for(self, items: Sequence[OrderItem]) -> CellSpec:
-        sides = [columns[:3] for item in items for _, columns in self._variants(item, self._faces)]
+        refuse_any((item for item in items if not self._variants(item, self._faces)), self._misfit)
+        variants = [(item, *each) for item in items for each in self._variants(item, self._faces)]
+        sides = [columns[:3] for _, _, columns in variants]
+        # The true centre and the true edges are off those of an item's cells; this is the greatest loss of distance.
+        lost = max(
+            math.dist([side * self.cell_mm for side in columns[:2]], _oriented(item, face[0])[:2]) / 2
+            for item, face, columns in variants
+        )
         wide, deep, high = (max(part) for part in zip(*sides, strict=True))
         length, width = (side // self.cell_mm for side in self.container[:2])
         bins = (len(self._faces) * wide, deep, high)  # an item on each of its faces, side by side
         with reworded(ValueError, lambda error: ValueError(f"cell={self.cell_mm} mm is too fine: {error}")):
-            cell = CellSpec(bin_size=bins, tote_size=(length, width, self.container[2]), **self._settings)
+            support = RoundedUp(max(CELL_MARGIN, LEAST_MARGIN + lost) / self.cell_mm)
+            cell = PackingCell(
+                support=support, bin_size=bins, tote_size=(length, width, self.container[2]), **self._settings
+            )
         handling = any(item.has_limits for item in items)
         return replace(
             cell, bin_items=len(self._faces), longest_side=max(wide, deep), handling=handling, most_items=len(items)
@@ -254,9 +276,15 @@ class OrderPacker:
         fill.tops[x : x + w, y : y + d] = below + packed.size[2]
         # A top is rounded up once, not with each item of its pile: so level tops are level within a millimetre.
         heights[x : x + w, y : y + d] = math.ceil(below + packed.size[2] - 1e-6)
-        for axis, count in enumerate((w, d)):
-            if packed.size[axis] < count * self.cell_mm - 1e-6:  # it does not fill its last cells
-                bearing[x : x + w, y : y + d].select(axis, count - 1).fill_(False)
+        # Where it does not fill its last cells, they bear nothing. If some of these support it, the hull of the support
+        # ends inside them: then a cell is in the true hull if it and the next one are in that of the cells.
+        part = bearing[x : x + w, y : y + d]
+        unfilled = [axis for axis, count in enumerate((w, d)) if packed.size[axis] < count * self.cell_mm - 1e-6]
+        for axis in [axis for axis in unfilled if part.select(axis, part.shape[axis] - 1).any()]:
+            count = part.shape[axis] - 1
+            part.narrow(axis, 0, count).logical_and_(part.narrow(axis, 1, count).clone())
+        for axis in unfilled:
+            part.select(axis, part.shape[axis] - 1).fill_(False)
 
     def _closed(self, fill: "_Filling") -> tuple[PackedContainer, Numbered]:
         """Return a container that gets no more items, and those that found no place in it."""

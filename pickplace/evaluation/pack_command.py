@@ -5,6 +5,7 @@ import csv
 import io
 import json
 import re
+from collections.abc import Container
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from pickplace.evaluation.pack import PackedContainer, PackedItem
     from pickplace.physics.plans import EpisodePlan
 
-MAX_LENGTH = 10_000  # of a container, mm
+PAGE = re.compile(r"replay(_[1-9]\d*)?\.html")  # names of the pages
 
 
 def main() -> None:
@@ -74,7 +75,6 @@ def run(args: argparse.Namespace) -> None:
     length, width, height = map(int, match.groups() if match else ())
     container = length, width, height
     refuse_if(not min(container), f"--container={args.container}: expected sides of 1 mm or more.")
-    refuse_if(not 1 <= args.cell <= MAX_LENGTH, f"--cell={args.cell}: expected 1 to {MAX_LENGTH:,} mm.")
     from pickplace.common.validate import one_of
     from pickplace.evaluation.pack import OrderPacker
     from pickplace.items.order_file import MILLIMETRES, read_orders
@@ -83,15 +83,15 @@ def run(args: argparse.Namespace) -> None:
 
     orders = read_orders(args.order, one_of("--unit", args.unit, MILLIMETRES), key="order")
     packer = OrderPacker(container, args.cell, args.planner, args.tipping)
-    for order in orders:  # before anything is written
+    for order in orders:  # before the first of them is packed
         packer.check(order.items)
-    folder, rows, bed_bpp = Path(args.out), [], {}
+    folder, rows, recorded = Path(args.out), [], []
+    bed_bpp: dict[str, list[dict]] = {}
     plans: list[EpisodePlan] = []
-    folder.mkdir(parents=True, exist_ok=True)
-    for number, order in enumerate(orders, 1):
+    for order in orders:
         cell, containers = packer.pack(order.items, args.keep_sequence)
-        name = order.name or Path(args.order).stem
-        for place, each in enumerate(containers, 1):
+        name, keys = _free_names(order.name or Path(args.order).stem, len(containers), bed_bpp)
+        for place, (key, each) in enumerate(zip(keys, containers, strict=True), 1):
             table = [_row(name, place, step, packed) for step, packed in enumerate(each.items, 1)]
             if args.tipping:
                 table = [
@@ -99,13 +99,10 @@ def run(args: argparse.Namespace) -> None:
                 ]
             write_output(_text(name, place, len(containers), each, table))
             rows += table
-            key = name if place == 1 else f"{name}#{place}"
-            while key in bed_bpp:  # another order has this name
-                key += "'"
             bed_bpp[key] = [_as_bed_bpp(packed) for packed in each.items]
             plans.append(_as_plan(len(plans), container, each))
-        file = "replay.html" if len(orders) == 1 else f"replay_{number}.html"
-        _write(folder, {file: page([each.recording for each in containers], cell, name)})
+        recorded.append(([each.recording for each in containers], cell, name))
+    folder.mkdir(parents=True, exist_ok=True)
     columns = io.StringIO()
     writer = csv.DictWriter(columns, rows[0], lineterminator="\n")
     writer.writeheader()
@@ -113,8 +110,22 @@ def run(args: argparse.Namespace) -> None:
     _write(folder, {
         "plan.csv": columns.getvalue(), "plan.json": json.dumps(bed_bpp, indent=1) + "\n", PLANS: to_lines(plans),
     })  # fmt: skip
-    pages = "replay.html" if len(orders) == 1 else f"replay_1.html to {file}"
+    files = [f"replay_{number}.html" for number in range(1, len(orders) + 1)] if len(orders) > 1 else ["replay.html"]
+    for file, each_page in zip(files, recorded, strict=True):
+        _write(folder, {file: page(*each_page)})
+    for old in [path for path in folder.iterdir() if PAGE.fullmatch(path.name) and path.name not in files]:
+        old.unlink()  # of an earlier run
+    pages = " to ".join(dict.fromkeys((files[0], files[-1])))
     write_output(f"{folder}: plan.csv, plan.json, {PLANS}, {pages}\n")
+
+
+def _free_names(name: str, count: int, taken: Container[str]) -> tuple[str, list[str]]:
+    """Return the name of an order, and those of its containers in ``plan.json``; a used name gets more quotes."""
+    while True:
+        keys = [name, *(f"{name}#{place}" for place in range(2, count + 1))]
+        if not any(key in taken for key in keys):
+            return name, keys
+        name += "'"
 
 
 def _row(name: str, container: int, step: int, packed: "PackedItem") -> dict:
@@ -145,17 +156,24 @@ def _text(name: str, place: int, count: int, container: "PackedContainer", rows:
 
 
 def _as_bed_bpp(packed: "PackedItem") -> dict:
-    """Return an action of a packing plan of BED-BPP: front left bottom corner; orientation 1: turned."""
-    from pickplace.items.order_file import ORIENTATIONS
+    """Return an action of a packing plan of BED-BPP: front left bottom corner; orientation 1: turned.
 
-    item = packed.item
+    BED-BPP does not know tipped items, so the sides are those of the item as it lies. Its code needs whole numbers.
+    """
+
+    def whole(value: float) -> float:
+        return int(value) if (value := round(value, 6)).is_integer() else value
+
+    item, (x, y, height) = packed.item, map(whole, packed.size)
+    length, width = (y, x) if packed.turned else (x, y)
     return {
         "item": {
-            "article": item.id, "id": item.id, "product_group": "", "length/mm": item.length, "width/mm": item.width,
-            "height/mm": item.height, "weight/kg": item.grams / 1000, "sequence": packed.number,
+            "article": item.article or item.id, "id": item.id, "product_group": item.product_group,
+            "length/mm": length, "width/mm": width, "height/mm": height, "weight/kg": item.grams / 1000,
+            "sequence": packed.number,
         },
-        "flb_coordinates": list(packed.corner),
-        "orientation": ORIENTATIONS.index(packed.orientation),
+        "flb_coordinates": [*map(whole, map(float, packed.corner))],
+        "orientation": int(packed.turned),
     }  # fmt: skip
 
 

@@ -1,7 +1,5 @@
 """Files of orders: lists of items with sides in millimetres and weights, as CSV, or as the JSON of BED-BPP."""
 
-import csv
-import io
 import json
 import math
 import re
@@ -10,16 +8,18 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from pickplace.common.files import MAX_TABLE_BYTES, read_text
-from pickplace.common.validate import at_most, excerpt, refuse_if, reworded, without_twins
+from pickplace.common.files import MAX_TABLE_BYTES, csv_rows, read_text
+from pickplace.common.validate import at_most, excerpt, expect, refuse_if, reworded, without_twins
 from pickplace.rules.item import MAX_GRAMS, NO_LIMIT
 
 #: Name of a column -> the names that a file may have for it, in any case; a unit may follow, as in ``length/mm``.
 NAMES = {
     "order": ("order", "order_id", "order_nr"),
-    "id": ("id", "sku", "article", "item"),
-    "length": ("length", "l", "w"),
-    "width": ("width", "d", "depth"),
+    "id": ("id", "sku", "item"),
+    "article": ("article",),
+    "product_group": ("product_group",),
+    "length": ("length", "l"),
+    "width": ("width", "w", "d", "depth"),
     "height": ("height", "h"),
     "weight": ("weight", "gross_weight", "mass", "kg", "g"),
     "quantity": ("quantity", "qty", "count"),
@@ -47,14 +47,14 @@ COLUMN = re.compile(r"(.*?)\s*(?:[/_ (\[]\s*(mm|cm|m|kg|g)\s*[)\]]?)?")  # a nam
 EXPECTED = "columns length, width, height and weight, such as length/mm and weight/kg; and order, id or quantity if any"
 
 MAX_LENGTH, MAX_LOAD = 10_000, 1_000_000_000  # of an item: 10 m; on it: 1,000 t
-MAX_NAME = 100  # letters of the name of an order or an article
+MAX_NAME = 100  # characters of the name of an order or an article
 MAX_QUANTITY, MAX_ITEMS = 10_000, 2_000_000  # of a line, of a file
 
 
 class OrderItem(NamedTuple):
     """One item of an order."""
 
-    id: str  # of the article; "" if the file has none
+    id: str  # of the article, or its name if that is all; "" if the file has none
     length: float  # along x as it lies in the bin, mm
     width: float  # along y, mm
     height: float  # mm
@@ -62,11 +62,13 @@ class OrderItem(NamedTuple):
     place: str  # the file and where in it, for messages, such as "orders.csv, line 7"
     max_load: int = NO_LIMIT  # greatest mass on top of it, g, rounded down
     orientations: tuple[str, ...] = ORIENTATIONS  # the allowed ones
+    article: str = ""  # name, which BED-BPP has beside the id
+    product_group: str = ""
 
     @property
     def kind(self) -> tuple:
-        """All fields but its id and its place in the file."""
-        return *self[1:5], *self[6:]
+        """Its size, weight and limits."""
+        return *self[1:5], self.max_load, self.orientations
 
     @property
     def turns(self) -> int:
@@ -91,7 +93,7 @@ class OrderItem(NamedTuple):
 
 
 class Order(NamedTuple):
-    """One order: its items in their order of arrival."""
+    """One order: its items in their order of arrival. Two orders may have one name, see :func:`read_orders`."""
 
     name: str
     items: list[OrderItem]
@@ -115,10 +117,19 @@ class _Column(NamedTuple):
     def number(self, row: Mapping) -> float:
         """Return the value in a row as a number, in the unit of the column; raise ``ValueError`` if it is none."""
         value = row[self.key]
-        refuse_if(isinstance(value, bool), "a bool is no number")
+        refuse_if(isinstance(value, bool) or "_" in str(value), "no number, though Python takes it for one")
         if isinstance(value, str) and self.decimal == "," and self.unit == 1:  # mm or g: no three decimals
-            refuse_if(re.fullmatch(r"\s*\d{1,3}(,\d{3})+\s*", value), "a comma that may separate thousands")
+            refuse_if(re.fullmatch(r"\s*\d{1,3}([.,]\d{3})+\s*", value), "it may have separators of thousands")
         return float(value.replace(self.decimal, ".") if isinstance(value, str) else value)
+
+    def expected(self, row: Mapping) -> str:
+        """Return words for a number, which say what is wrong with the separators of the value in a row."""
+        text = str(row[self.key])
+        if self.decimal == "." and "," in text:
+            return "a number with a decimal point"
+        if self.decimal == "," and re.search(r"\d[.,]\d{3}", text):
+            return "a number without separators of thousands" + " (three decimals look like one)" * (self.unit == 1)
+        return "a number"
 
 
 def read_orders(path, unit: str = "mm", key: str = "items.path", target: str | None = None) -> list[Order]:
@@ -127,7 +138,8 @@ def read_orders(path, unit: str = "mm", key: str = "items.path", target: str | N
     A CSV has a header and a line for each item, or for each article with its ``quantity``. Commas, semicolons or tabs
     separate the columns; with semicolons or tabs, decimals may have a comma. Lines with the same
     ``order`` are one order; without that column the whole file is one. JSON is that of BED-BPP: for each order
-    ``item_sequence``, its items by their number.
+    ``item_sequence``, its items by their number. In names, a control character becomes "?"; orders whose names differ
+    only there stay apart.
 
     Optional columns limit an item: ``max_load`` (empty: any), ``stackable`` or ``nothing_on_top`` (yes or no), and
     ``orientations`` (:data:`WORDS`, or some of :data:`ORIENTATIONS`).
@@ -149,7 +161,7 @@ def read_orders(path, unit: str = "mm", key: str = "items.path", target: str | N
     text = read_text(path, MAX_TABLE_BYTES, "utf-8-sig", empty=False)
     rows = _rows_of_json(path, text) if path.suffix.lower() == ".json" else _rows_of_csv(path, text)
     orders: dict[str, list[OrderItem]] = {}
-    articles: dict[str, OrderItem] = {}
+    articles: dict[str, OrderItem] = {}  # by id
     columns: dict[tuple[str, ...], dict[str, _Column]] = {}
     total, targets = 0, dict[str, None]()
     for place, header, values, header_place, decimal in rows:
@@ -164,13 +176,14 @@ def read_orders(path, unit: str = "mm", key: str = "items.path", target: str | N
             "expected one size and weight for each id.",
         )
         at_most(f"{path}:", total := total + quantity, "items", MAX_ITEMS)
-        goal = _printable(row[columns[header]["target"].key]) if "target" in columns[header] else ""
+        goal = _name(item.place, row, columns[header], "target")
         targets[goal] = None
         if target in (None, goal):
-            orders.setdefault(order, []).extend([item] * quantity)
+            shown = item._replace(id=_printable(item.id))
+            orders.setdefault(order, []).extend([shown] * quantity)
     words = "" if target is None else f" for target={target}, but for {excerpt([*targets])}"
     refuse_if(not orders, f"{path}: no items{words}, expected at least one.")
-    return [Order(name, items) for name, items in orders.items()]
+    return [Order(_printable(name), items) for name, items in orders.items()]
 
 
 def _words(item: OrderItem) -> str:
@@ -185,25 +198,22 @@ def _words(item: OrderItem) -> str:
 def _rows_of_csv(path: Path, text: str) -> Iterator[_Row]:
     first = text.lstrip().partition("\n")[0]
     separator = max(",;\t", key=first.count)
-    with reworded(csv.Error, lambda error: ValueError(f"{path}: {error}; expected a CSV in UTF-8.")):
-        reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
-        header: tuple[str, ...] = ()
-        header_line = 0
-        for row in reader:
-            fields = tuple(field.strip() for field in row)
-            if not any(fields):
-                continue
-            if header:
-                count, place = len(fields), f"line {reader.line_num}"
-                hint = "; decimals need a point" if count > len(header) and separator == "," else ""
-                refuse_if(
-                    count != len(header),
-                    f"{path}, {place}: got {count} field{'s' * (count != 1)}, expected {len(header)} as in the header"
-                    f"{hint}.",
-                )
-                yield _Row(place, header, fields, f"line {header_line}", "." if separator == "," else ",")
-            else:
-                header, header_line = fields, reader.line_num
+    header: tuple[str, ...] = ()
+    header_place = ""
+    for line, row in csv_rows(path, text, separator):
+        fields, place = tuple(row), f"line {line}"
+        if not any(fields) or (not header and fields == ("sep=", "")):  # as a spreadsheet declares the separator
+            continue
+        if not header:
+            header, header_place = fields, place
+            continue
+        count = len(fields)
+        hint = "; decimals need a point" if count > len(header) and separator == "," else ""
+        refuse_if(
+            count != len(header),
+            f"{path}, {place}: got {count} field{'s' * (count != 1)}, expected {len(header)} as in the header{hint}.",
+        )
+        yield _Row(place, header, fields, header_place, "." if separator == "," else ",")
 
 
 def _rows_of_json(path: Path, text: str) -> Iterator[_Row]:
@@ -220,6 +230,10 @@ def _rows_of_json(path: Path, text: str) -> Iterator[_Row]:
         items = order.get("item_sequence") if isinstance(order, dict) else None
         if not isinstance(items, dict) or not all(number.isdecimal() and len(number) < 10 for number in items):
             raise wrong(f"order {excerpt(name)} has no item_sequence with numbers as its keys")
+        if not items:
+            raise wrong(f"order {excerpt(name)} has no items")
+        if len({*map(int, items)}) < len(items):
+            raise wrong(f"order {excerpt(name)} has two items with one number")
         properties = order.get("properties")
         about = {"target": properties.get("target")} if isinstance(properties, dict) else {}
         for number in sorted(items, key=int):
@@ -239,18 +253,14 @@ def _read_header(place: str, header: Sequence, unit: str, decimal: str) -> dict[
         known = name in {each for names in NAMES.values() for each in names}
         refuse_if(known and name in found, f"{place}: two columns {excerpt(name)}; expected one.")
         found[name] = key, suffix
-    for column in ("max_load", "orientations"):
-        given = [name for name in NAMES[column] if name in found]
-        refuse_if(len(given) > 1, f"{place}: columns {' and '.join(map(excerpt, given))}; expected one of them.")
     # In l,w,h and length,width,height the width is the second side; in w,d,h and width,depth,height the first.
-    second = {}
-    if {"length", "l"} & {*found}:
-        second = {"length": ("length", "l"), "width": ("width", "w", "d", "depth")}
-    elif {"d", "depth"} & {*found}:
-        second = {"length": ("w", "width"), "width": ("d", "depth")}
+    is_second = {"length", "l"} & {*found} or not {"d", "depth"} & {*found}
+    names_of = NAMES if is_second else NAMES | {"length": ("w", "width"), "width": ("d", "depth")}
     columns = {}
-    for column, names in (NAMES | second).items():
-        for name in (name for name in names if name in found and column not in columns):
+    for column, names in names_of.items():
+        given = [name for name in names if name in found]
+        refuse_if(len(given) > 1, f"{place}: columns {' and '.join(map(excerpt, given))}; expected one of them.")
+        for name in given:
             key, suffix = found[name]
             units = UNITS.get(column, {None: 1.0})
             default = name if name in units else unit if column in SIDES else DEFAULT_WEIGHT
@@ -268,10 +278,16 @@ def _read_header(place: str, header: Sequence, unit: str, decimal: str) -> dict[
     return columns
 
 
-def _printable(name) -> str:
-    """Return a name from a file with "?" for each control character or line break; "" for None."""
-    text = "" if name is None else str(name)
-    return "".join(letter if letter.isprintable() else "?" for letter in text)[:MAX_NAME]
+def _printable(name: str) -> str:
+    """Return the beginning of a name from a file, with "?" for each control character or line break."""
+    return "".join(letter if letter.isprintable() else "?" for letter in name[:MAX_NAME])
+
+
+def _name(place: str, row: Mapping, columns: dict[str, _Column], column: str) -> str:
+    """Return a name of a row as it stands in the file; "" if it has none."""
+    value = row[columns[column].key] if column in columns else None
+    text = "" if value is None else str(value)
+    return expect(len(text) <= MAX_NAME, f"{place}: {column}", text, f"at most {MAX_NAME} characters")
 
 
 def _read_row(place: str, row: Mapping, columns: dict[str, _Column]) -> tuple[OrderItem, str, int]:
@@ -282,17 +298,16 @@ def _read_row(place: str, row: Mapping, columns: dict[str, _Column]) -> tuple[Or
         with suppress(TypeError, ValueError, OverflowError):
             if 0 < (number := columns[name].number(row)) * unit <= most:
                 return number * unit
-        comma = {",": "a number without separators of thousands", ".": "a number with a decimal point"}
-        what = comma[columns[name].decimal] if "," in str(row[key]) else "a number"
-        raise ValueError(f"{place}: {key}={excerpt(row[key])}: expected {what} above 0, at most {most / unit:,g}.")
+        expected = f"{columns[name].expected(row)} above 0, at most {most / unit:,g}"
+        raise ValueError(f"{place}: {key}={excerpt(row[key])}: expected {expected}.")
 
     length, width, height = (read(name, MAX_LENGTH) for name in SIDES)
     grams = max(1, math.ceil(read("weight", MAX_GRAMS) - 1e-6))
     count = read("quantity", MAX_QUANTITY) if "quantity" in columns else 1.0
     refuse_if(count != int(count), f"{place}: {count:g} pieces; expected a whole number.")
-    identity, order = (_printable(row[columns[name].key]) if name in columns else "" for name in ("id", "order"))
+    identity, order, *names = (_name(place, row, columns, name) for name in ("id", "order", "article", "product_group"))
     limits = _read_max_load(place, row, columns), _read_orientations(place, row, columns)
-    return OrderItem(identity, length, width, height, grams, place, *limits), order, int(count)
+    return OrderItem(identity or names[0], length, width, height, grams, place, *limits, *names), order, int(count)
 
 
 def _read_max_load(place: str, row: Mapping, columns: dict[str, _Column]) -> int:
@@ -305,7 +320,8 @@ def _read_max_load(place: str, row: Mapping, columns: dict[str, _Column]) -> int
             load = columns["max_load"].number(row) * unit
         refuse_if(
             not 0 <= load <= MAX_LOAD,
-            f"{place}: {key}={excerpt(value)}: expected a number from 0 to {int(MAX_LOAD / unit):,}, or nothing.",
+            f"{place}: {key}={excerpt(value)}: expected {columns['max_load'].expected(row)} from 0 to "
+            f"{int(MAX_LOAD / unit):,}, or nothing.",
         )
         loads.append(math.floor(load + 1e-6))
     for column, forbids in (("stackable", False), ("nothing_on_top", True)):

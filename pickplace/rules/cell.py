@@ -3,6 +3,7 @@
 from dataclasses import InitVar, dataclass, field, fields
 from functools import cached_property
 from inspect import signature
+from typing import ClassVar
 
 from pickplace.common.validate import (
     at_most,
@@ -98,6 +99,8 @@ class CellSpec:
     pick_rule: InitVar[str | None] = None
     min_seal: InitVar[float | None] = None
 
+    max_actions: ClassVar[int] = MAX_ACTIONS  # greatest number of flat actions
+
     def __post_init__(self, effector_size, body, cup, cup_size, pick_rule, min_seal):
         expect(isinstance(self.gripper, Gripper), "gripper", self.gripper, "a Gripper, such as Contain(size=(3, 3))")
         read = {
@@ -129,7 +132,7 @@ class CellSpec:
         bin_size, tote_size = f"bin_size={[*self.bin_size]}", f"tote_size={[*self.tote_size]}"
         at_most(f"{bin_size}: the bin has", self.num_picks, "cells", MAX_CELLS)
         at_most(f"{tote_size}: the tote has", self.num_places, "cells", MAX_CELLS)
-        at_most(f"{bin_size}, {tote_size}: the cell has", self.num_actions, "actions", MAX_ACTIONS)
+        at_most(f"{bin_size}, {tote_size}: the cell has", self.num_actions, "actions", self.max_actions)
         if self.limits is not None:
             self.limits.check(self)
 

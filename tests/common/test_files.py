@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pickplace.common.files import replaced_file, sync_folder
+from pickplace.common.files import read_table, replaced_file, sync_folder
 
 
 def test_an_error_names_the_file_that_was_asked_for(tmp_path):
@@ -37,6 +37,12 @@ def test_a_new_file_and_its_name_reach_the_disk(tmp_path, monkeypatch):
     with replaced_file(tmp_path / "x.csv") as new:
         new.write_text("1")
     assert synced == [(".x.new.csv", False), (tmp_path.name, True)]
+
+
+def test_a_quote_that_is_never_closed_is_named_with_its_line(tmp_path):
+    (path := tmp_path / "x.csv").write_text('w,d,h\n"1",1,1\n1,1,"2\n1,1,1\n')
+    with pytest.raises(ValueError, match="x.csv, line 3: unexpected end of data; expected a CSV in UTF-8"):
+        read_table("items.path", path, "w,d,h")
 
 
 def test_a_folder_that_cannot_be_synced_is_left_alone(tmp_path):
