@@ -83,7 +83,7 @@ def compose_training(words: list[str]) -> DictConfig:
     """Return the config that ``pickplace-train`` makes of a command line, such as ``["experiment=quick", "seed=1"]``.
 
     Raises:
-        ValueError: for a word that the command would refuse before it trains.
+        ValueError: for several values of a key, an unknown key, or one without a value.
     """
     refuse_several_values(words)
     running = HydraConfig.instance()
@@ -118,7 +118,7 @@ def check_keys(cfg: DictConfig, config_name: str, from_checkpoint: tuple[str, ..
 def refuse_several_values(words: list[str]) -> None:
     """Refuse words that only a sweep understands."""
     several = [str(word.input_line) for word in parse(words) if word.is_sweep_override()]
-    refuse_any(several, lambda word: f"{word}: several values; expected -m for a sweep, or one value.")
+    refuse_any(several, lambda word: f"{word}: several values; expected one, or the command with -m for a sweep.")
 
 
 def compose_first_job(config_name: str, words: list[str]) -> DictConfig:

@@ -103,6 +103,8 @@ def run(args: argparse.Namespace) -> None:
             plans.append(_as_plan(len(plans), container, each))
         recorded.append(([each.recording for each in containers], cell, name))
     folder.mkdir(parents=True, exist_ok=True)
+    # The pages of an earlier run: other commands write no such plan.
+    earlier = [path for path in folder.iterdir() if PAGE.fullmatch(path.name)] if (folder / "plan.csv").exists() else []
     columns = io.StringIO()
     writer = csv.DictWriter(columns, rows[0], lineterminator="\n")
     writer.writeheader()
@@ -113,8 +115,8 @@ def run(args: argparse.Namespace) -> None:
     files = [f"replay_{number}.html" for number in range(1, len(orders) + 1)] if len(orders) > 1 else ["replay.html"]
     for file, each_page in zip(files, recorded, strict=True):
         _write(folder, {file: page(*each_page)})
-    for old in [path for path in folder.iterdir() if PAGE.fullmatch(path.name) and path.name not in files]:
-        old.unlink()  # of an earlier run
+    for old in [path for path in earlier if path.name not in files]:
+        old.unlink()
     pages = " to ".join(dict.fromkeys((files[0], files[-1])))
     write_output(f"{folder}: plan.csv, plan.json, {PLANS}, {pages}\n")
 

@@ -54,7 +54,7 @@ MAX_QUANTITY, MAX_ITEMS = 10_000, 2_000_000  # of a line, of a file
 class OrderItem(NamedTuple):
     """One item of an order."""
 
-    id: str  # of the article, or its name if that is all; "" if the file has none
+    id: str  # of the article; without one, the article's name; "" if the file has neither
     length: float  # along x as it lies in the bin, mm
     width: float  # along y, mm
     height: float  # mm
@@ -138,8 +138,8 @@ def read_orders(path, unit: str = "mm", key: str = "items.path", target: str | N
     A CSV has a header and a line for each item, or for each article with its ``quantity``. Commas, semicolons or tabs
     separate the columns; with semicolons or tabs, decimals may have a comma. Lines with the same
     ``order`` are one order; without that column the whole file is one. JSON is that of BED-BPP: for each order
-    ``item_sequence``, its items by their number. In names, a control character becomes "?"; orders whose names differ
-    only there stay apart.
+    ``item_sequence``, its items by their number. In the names that are returned, a control character is "?". Orders
+    are told apart by their names in the file.
 
     Optional columns limit an item: ``max_load`` (empty: any), ``stackable`` or ``nothing_on_top`` (yes or no), and
     ``orientations`` (:data:`WORDS`, or some of :data:`ORIENTATIONS`).
@@ -284,10 +284,15 @@ def _printable(name: str) -> str:
 
 
 def _name(place: str, row: Mapping, columns: dict[str, _Column], column: str) -> str:
-    """Return a name of a row as it stands in the file; "" if it has none."""
-    value = row[columns[column].key] if column in columns else None
-    text = "" if value is None else str(value)
-    return expect(len(text) <= MAX_NAME, f"{place}: {column}", text, f"at most {MAX_NAME} characters")
+    """Return a name of a row as it stands in the file; "" if it has none. One that tells orders or articles apart must
+    be short; others are cut."""
+    if column not in columns:
+        return ""
+    key = columns[column].key
+    text = "" if row[key] is None else str(row[key])
+    if column in ("id", "order", "target"):
+        expect(len(text) <= MAX_NAME, f"{place}: {key}", text, f"at most {MAX_NAME} characters")
+    return text[:MAX_NAME]
 
 
 def _read_row(place: str, row: Mapping, columns: dict[str, _Column]) -> tuple[OrderItem, str, int]:

@@ -81,7 +81,9 @@ class Plan:
     occupancy_before: float  #: share of the tote's volume below the surface that the depth map shows, 0 to 1
     occupancy_after: float  #: the same with the item
     alternatives: list[Alternative]  #: the most probable choices, best first; none if nothing is feasible
-    reasons: dict[str, int] | None  #: how many flat actions fail for each reason; if rejected, of the chosen one
+    reasons: (
+        dict[str, int] | None
+    )  #: without a plan: how many actions fail for each reason; if rejected, of the chosen one
     #: with ``support="bearing"``: 1 where the tote bears weight once the item rests, for the next call; else None
     tote_bearing: list[list[int]] | None
     warnings: list[str]  #: a sentence for each thing that lies outside the policy's training
@@ -203,10 +205,10 @@ class Planner:
         planner.restart()
         status, action, ranking = _decide(planner, problem, observation)
         number = None if action is None else int(problem.taken_items(action))
-        reasons = None if status == "ok" else _reasons(problem, action)
-        if reasons is not None:
-            self._refuse_unknown(scene, device)
-            action = None
+        reasons = None
+        if status != "ok":
+            self._refuse_unknown(scene, device)  # first: all reasons take a while
+            reasons, action = _reasons(problem, action), None
         known = 0 if problem.maps.bin_items == 1 else number
         motion = None if action is None else problem.motion(action)
         pick, place, turn, drop_height = motion or (None,) * 4

@@ -39,7 +39,7 @@ FIXED_KEYS = (
     "seed", "items", "model.mask_infeasible", "collector.workers", "curriculum.levels", "warm_start.weights",
 )  # fmt: skip
 
-#: Settings that change nothing in what is trained and validated.
+#: Settings that a user may change without asking for more training.
 SILENT_KEYS = ("quiet", "threads", "progress_interval", "checkpoint_interval", "logger")
 
 

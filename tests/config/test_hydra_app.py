@@ -82,7 +82,7 @@ BAD = [
     ("evaluate", "planner=[[1,2],[3]]", ["planner=[[1,2],[3]]"]),
     ("evaluate", "--cfg foo", ["--cfg", "'foo'", "job"]),
     ("train", "env.tote_size=[6,6", ["'env.tote_size=[6,6'", "<key>=<value>"]),
-    ("train", "seed=1,2", ["seed=1,2: several values; expected -m for a sweep"]),
+    ("train", "seed=1,2", ["seed=1,2: several values; expected one, or the command with -m"]),
     ("train", "-m hydra.run.dir=x", ["hydra.run.dir=x: this is a sweep; expected hydra.sweep.dir=<folder>."]),
     ("train", "hydra.sweep.dir=x", ["hydra.sweep.dir=x: this is a run; expected hydra.run.dir=<folder>."]),
     ("train", "curriculum=null", ["curriculum=null", "adaptive", "paper"]),
@@ -244,6 +244,7 @@ def test_a_config_is_composed_as_the_command_does(search):
             compose_training([words])
 
 
+@pytest.mark.slow
 def test_own_values_in_a_sweep(run, search, monkeypatch):
     given = []
     monkeypatch.setattr(train, "train", lambda cfg, run_dir: given.append(cfg.curriculum.advance))

@@ -255,7 +255,7 @@ OPTIONS = {(number, value) for number, values in enumerate(EACH) for value in va
 @pytest.mark.parametrize(
     ("transitions", "full_masks", "handling", "seed"),
     [
-        (1_200, 27, 0.4, 2),
+        (2_000, 45, 0.4, 2),
         pytest.param(1_000_000, 10_000, 0.2, 0, marks=pytest.mark.slow),
         pytest.param(200_000, 2_000, 1.0, 1, marks=pytest.mark.slow),
     ],

@@ -119,6 +119,7 @@ def test_a_cost_does_not_depend_on_the_unit_of_heights():
             assert torch.equal(action, planner.decide(observation))
 
 
+@pytest.mark.slow
 def test_corner_packs_about_as_well_as_joint_dbl():
     packed = [
         occupancies(planner(PickPlaceEnv(num_envs=1).cell), PickPlaceEnv(num_envs=40, masks=(), stream="test")).mean()

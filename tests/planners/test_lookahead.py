@@ -136,6 +136,7 @@ def gain_bounds(gain):
     return gain.mean() - error, gain.mean() + error
 
 
+@pytest.mark.slow
 def test_it_is_better_than_its_policy_and_a_critic_that_errs_does_not_make_it_worse(monkeypatch):
     def worst(observation):  # of any two states, the one with fewer columns full
         return -100.0 * (observation["tote_depth"] == 0).flatten(1).sum(1, keepdim=True)

@@ -24,6 +24,7 @@ def search_of(env, simulations, **settings):
     return MCTS(env.cell, env.items, simulations, **{"mask": True, "wave": 512, **settings})
 
 
+@pytest.mark.slow
 def test_more_simulations_come_closer_to_the_optimum():
     few, many = (search_of(make_env(), simulations) for simulations in (16, 200))
     for search, low, high in ((few, 1, 1.5), (many, 1.5, 16)):

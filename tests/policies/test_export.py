@@ -44,7 +44,9 @@ def test_torch_export_takes_any_size(name):
         torch.testing.assert_close(program(*example), scores(*example), rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize(("patch", "bin_items", "preview"), [(2, 1, 0), (1, 2, 3)])
+@pytest.mark.parametrize(("patch", "bin_items", "preview"), [
+    (2, 1, 0), (1, 2, 3), *(pytest.param(*each, marks=pytest.mark.slow) for each in ((1, 1, 0), (1, 2, 0), (1, 1, 3))),
+])  # fmt: skip
 def test_torch_export_of_values_takes_any_tote(patch, bin_items, preview):
     torch.manual_seed(0)
     cell = CellSpec(support=Bearing(), bin_items=bin_items, longest_side=3, preview=preview)

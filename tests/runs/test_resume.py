@@ -79,7 +79,7 @@ def test_a_run_that_is_killed_and_stopped_equals_an_undisturbed_one(collector, u
     assert rows[0]["curriculum/level"] < rows[-1]["curriculum/level"]  # it really trains
 
 
-@pytest.mark.parametrize("refill", ["each", "batch"])
+@pytest.mark.parametrize("refill", ["each", pytest.param("batch", marks=pytest.mark.slow)])
 def test_several_items_in_the_bin_are_resumed_exactly(refill, tmp_path, no_report):
     several = ["env.bin_items=3", "env.bin_size=[5,5,1]", f"env.refill={refill}", "algo.advantages=gae"]
     several += [f"warm_start.{key}={ITERATION}" for key in ("frames", "critic_frames")]

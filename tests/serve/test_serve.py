@@ -583,7 +583,7 @@ def test_the_schema_says_units_and_frames(client):
         (["--host", "0.0.0.0"], None, "--host=0.0.0.0: other machines can reach it; expected a token in the environ"),
         (["--host", "example.org"], None, "--host=example.org: other machines"),
         ([], "short", "PICKPLACE_TOKEN: got 5 characters; expected at least 16"),
-        ([], "", "PICKPLACE_TOKEN: got 0 letters"),
+        ([], "", "PICKPLACE_TOKEN: got 0 characters"),
         (["--port", "70000"], None, "--port=70000"),
         (["--rate", "0"], None, "--rate=0"),
         (["--history", "0"], None, "--history=0"),

@@ -97,7 +97,7 @@ def test_a_training_that_a_callback_ends_is_a_complete_one(smoke, tmp_path, capl
     (run_dir / ".hydra" / "config.yaml").write_text("total_frames: 1024\n")
     (run_dir / ".hydra" / "overrides.yaml").write_text("[]\n")
     assert read_run(run_dir).status == "finished"
-    silent = ["threads=2", "progress_interval=7", "logger._target_=csv"]  # they change nothing in the training
+    silent = ["threads=2", "progress_interval=7", "logger._target_=csv"]  # they ask for no more training
     assert resume_run([f"resume={run_dir}", "trust=test_callbacks", *silent]) == rows[-1]["eval/occupancy"]
     assert read_csv(run_dir / "metrics.csv") == rows
     assert "a callback ended this training at 256 frames" in caplog.text

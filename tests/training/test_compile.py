@@ -210,6 +210,7 @@ def test_a_recorded_collector_returns_the_same_entries(collector, tmp_path):
     assert set(found["tote_height"].flatten().tolist()) == {1}
 
 
+@pytest.mark.slow
 def test_a_recorded_training_that_is_killed_and_resumed_equals_one_that_is_not(tmp_path, no_report):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     whole.mkdir()

@@ -21,7 +21,7 @@ from pickplace.training.curriculum.transform import ToteHeightCurriculum, push_l
 
 SAMPLERS = [  # shares of the heights 2 to 5, at level 5
     (Current(), [0, 0, 0, 1]), (Uniform(), [1 / 4] * 4), (Recent(0.25), [1 / 12] * 3 + [3 / 4]),
-    (Recent(1.0), [1 / 3] * 3 + [0]), (Recent(0.0), [0, 0, 0, 1]),
+    (Recent(0.9), [3 / 10] * 3 + [1 / 10]), (Recent(0.0), [0, 0, 0, 1]),
 ]  # fmt: skip
 
 

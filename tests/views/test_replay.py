@@ -218,6 +218,7 @@ def test_page_opens_at_the_end(browser, tmp_path):
     wait_until(browser, f"replay.state().at < {moves}")
 
 
+@pytest.mark.slow
 def test_page_of_very_many_moves(browser, tmp_path):
     """More than a function takes arguments."""
     moves = [Move((1, 1, 1, 1, 1 + n % 2), (0, 0), (0, 0), 0, (0, 0, 1, 1), 0, Failure.NONE) for n in range(1500)]
