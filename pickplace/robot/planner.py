@@ -81,9 +81,7 @@ class Plan:
     occupancy_before: float  #: share of the tote's volume below the surface that the depth map shows, 0 to 1
     occupancy_after: float  #: the same with the item
     alternatives: list[Alternative]  #: the most probable choices, best first; none if nothing is feasible
-    reasons: (
-        dict[str, int] | None
-    )  #: without a plan: how many actions fail for each reason; if rejected, of the chosen one
+    reasons: dict[str, int] | None  #: without a plan: how many actions fail for each reason; if rejected, the chosen's
     #: with ``support="bearing"``: 1 where the tote bears weight once the item rests, for the next call; else None
     tote_bearing: list[list[int]] | None
     warnings: list[str]  #: a sentence for each thing that lies outside the policy's training
