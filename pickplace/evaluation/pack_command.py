@@ -160,7 +160,7 @@ def _text(name: str, place: int, count: int, container: "PackedContainer", rows:
 def _as_bed_bpp(packed: "PackedItem") -> dict:
     """Return an action of a packing plan of BED-BPP: front left bottom corner; orientation 1: turned.
 
-    BED-BPP does not know tipped items, so the sides are those of the item as it lies. Its code needs whole numbers.
+    BED-BPP does not know tipped items: they get the sides that they have as they lie. Its code needs whole numbers.
     """
 
     def whole(value: float) -> float:
