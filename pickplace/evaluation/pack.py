@@ -204,7 +204,7 @@ class OrderPacker:
         refuse_any((item for item in items if not self._variants(item, self._faces)), self._misfit)
         variants = [(item, *each) for item in items for each in self._variants(item, self._faces)]
         sides = [columns[:3] for _, _, columns in variants]
-        # An item's true centre is not that of its cells, and so it may be nearer to the edge of its support, by this.
+        # An item's true centre may be this much nearer to the edge of its support than the centre of its cells.
         lost = max(
             math.dist([side * self.cell_mm for side in columns[:2]], _oriented(item, face[0])[:2]) / 2
             for item, face, columns in variants
@@ -276,8 +276,8 @@ class OrderPacker:
         fill.tops[x : x + w, y : y + d] = below + packed.size[2]
         # A top is rounded up once, not with each item of its pile: so level tops are level within a millimetre.
         heights[x : x + w, y : y + d] = math.ceil(below + packed.size[2] - 1e-6)
-        # Last cells that it does not fill bear nothing. Where they support it, the true hull of its support is smaller
-        # than that of the cells, by less than a cell. So a cell bears only if the next one is in the hull, too.
+        # An item bears nothing on a last cell that it does not fill. Where such cells support it, its true support ends
+        # up to a cell earlier than on the grid. So any other cell then bears only if the cell after it does, too.
         part = bearing[x : x + w, y : y + d]
         unfilled = [axis for axis, count in enumerate((w, d)) if packed.size[axis] < count * self.cell_mm - 1e-6]
         for axis in [axis for axis in unfilled if part.select(axis, part.shape[axis] - 1).any()]:

@@ -58,7 +58,10 @@ class MapPlanner(ABC):
         """
 
     def restart(self) -> None:  # noqa: B027
-        """Begin random draws anew. A robot asks for it before each plan, so that equal scenes have equal plans."""
+        """Begin random draws anew; by default there are none.
+
+        A robot calls it before each plan, so that equal scenes have equal plans.
+        """
 
     @torch.no_grad()
     def decide(self, observation: Observation) -> Tensor:
