@@ -1,15 +1,18 @@
 """Make the paper's comparison: python benchmarks/paper.py
 
-Trains with three seeds, plays the test stream, and writes a table and figures into docs/results/paper.
-Finished trainings and episodes in outputs/paper are read; stopped trainings go on.
-``python benchmarks/paper.py fcn4d-R4-0`` runs only this training, so that several processes can share the work.
+Trains with three seeds and plays the test stream. docs/results/paper keeps what was measured: the occupancy of each
+episode (episodes.csv) and the learning curves (curves.csv), from which a table (summary.csv) and figures are made.
+What these files have is not measured again: without them everything is. A stopped training in outputs/paper goes on.
+``python benchmarks/paper.py fcn4d-R4-0`` trains and plays only this, so that several processes can share the work.
 """
 
 import csv
+import io
 import sys
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import product
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +24,7 @@ from pickplace.runs.loggers import read_csv
 from pickplace.views.figures import COLOURS, figure_of
 
 RESULTS, RUNS = ROOT / "docs" / "results" / "paper", ROOT / "outputs" / "paper"
+EPISODES, CURVES = RESULTS / "episodes.csv", RESULTS / "curves.csv"
 SMALL, LARGE = ("6x6x5", "6x6x10", "10x10x5", "10x10x10"), ("30x30x5", "30x30x10")
 CANDIDATES = (1, 2, 3, 5, 10, 20, 50)
 MOST, MANY, FEW = 500, 100, 10  # numbers of episodes: where a tote takes a moment, seconds, or minutes
@@ -75,36 +79,92 @@ class Cell(NamedTuple):
         return MOST if self.tote == "6x6x5" else MANY
 
 
-def cells() -> Iterator[Cell]:
-    """Yield all cells that are played."""
-    for (method, turns), training in TRAININGS.items():
-        for tote, seed in product(training.totes, range(training.seeds)):
-            every = CANDIDATES if (turns, tote) == (3, "6x6x5") else (1, 10)
-            if tote in SMALL or seed == 0:
-                yield from (Cell(method, turns, tote, k, seed) for k in every)
+class Trained(NamedTuple):
+    """One training."""
+
+    method: str
+    R: int
+    seed: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.method}-R{self.R}-{self.seed}"
+
+    @property
+    def folder(self) -> Path:
+        return RUNS / self.name
+
+    def cells(self) -> Iterator[Cell]:
+        """Yield what its policy plays."""
+        for tote in TRAININGS[self.method, self.R].totes:
+            every = CANDIDATES if (self.R, tote) == (3, "6x6x5") else (1, 10)
+            if tote in SMALL or self.seed == 0:
+                yield from (Cell(self.method, self.R, tote, k, self.seed) for k in every)
+
+
+def untrained() -> Iterator[Cell]:
+    """Yield what the methods that are not trained play."""
     for method, turns, tote in product(("joint_dbl", "individual_heuristic"), (3, 4), SMALL + LARGE):
         yield Cell(method, turns, tote)
     yield from (Cell("mcts", 4, tote) for tote in SMALL[:3])
 
 
-def train(method: str, turns: int, seed: int) -> None:
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """Return the rows of a file; none without the file."""
+    return list(csv.DictReader(path.open(newline=""))) if path.is_file() else []
+
+
+def append_rows(path: Path, rows: Iterable[dict]) -> None:
+    """Add rows to a file in one write, as several processes may do so; a new file begins with its columns' names."""
+    text = io.StringIO()
+    for row in rows:
+        writer = csv.DictWriter(text, row, lineterminator="\n")
+        if not path.is_file() and not text.tell():
+            writer.writeheader()
+        writer.writerow({key: round(v, 5) if isinstance(v, float) else v for key, v in row.items()})
+    RESULTS.mkdir(exist_ok=True)
+    with path.open("a") as file:
+        file.write(text.getvalue())
+
+
+def played() -> dict[Cell, list[float]]:
+    """Return the occupancy of each episode, by cell, of all that was played."""
+    number = lambda text: int(text) if text else None  # noqa: E731
+    rows = read_rows(EPISODES)
+    cells = [Cell(row["method"], int(row["R"]), row["tote"], number(row["K"]), number(row["seed"])) for row in rows]
+    return {cell: [float(x) for x in row["occupancies"].split()] for cell, row in zip(cells, rows, strict=True)}
+
+
+def train(training: Trained) -> None:
     """Train, or go on with a training, unless it is finished."""
-    folder = RUNS / f"{method}-R{turns}-{seed}"
-    if not (folder / "report.html").is_file():
-        new = [*TRAININGS[method, turns].words.split(), f"seed={seed}", f"hydra.run.dir={folder}"]
-        run("pickplace-train", *([f"resume={folder}"] if (folder / "checkpoints").is_dir() else new), "threads=1")
+    if not (training.folder / "report.html").is_file():
+        words = TRAININGS[training.method, training.R].words.split()
+        new = [*words, f"seed={training.seed}", f"hydra.run.dir={training.folder}"]
+        stopped = (training.folder / "checkpoints").is_dir()
+        run("pickplace-train", *([f"resume={training.folder}"] if stopped else new), "threads=1")
 
 
-def play(cell: Cell) -> list[float]:
-    """Return the occupancy of each episode of the test stream."""
-    words = [f"env.tote_size=[{cell.tote.replace('x', ',')}]", f"evaluation.episodes={cell.episodes}"]
-    words += ["evaluation.batch_size=50", "evaluation.latency_decisions=0"]
-    if cell.seed is None:
-        words += ["env=paper", f"env.rotations={cell.R}", f"planner={cell.method}"]
-    else:
-        words += [f"checkpoint={RUNS / f'{cell.method}-R{cell.R}-{cell.seed}'}", f"planner.candidates={cell.K}"]
-    folder = RUNS / "played" / "-".join(str(part) for part in cell if part is not None)
-    return evaluate(folder, *words)["occupancy"]["per_episode"]
+def play(cells: Iterable[Cell]) -> None:
+    """Play the test stream in each cell, unless it was played."""
+    for cell in [cell for cell in cells if cell not in played()]:
+        words = [f"env.tote_size=[{cell.tote.replace('x', ',')}]", f"evaluation.episodes={cell.episodes}"]
+        words += ["evaluation.batch_size=50", "evaluation.latency_decisions=0"]
+        if cell.seed is None:
+            words += ["env=paper", f"env.rotations={cell.R}", f"planner={cell.method}"]
+        else:
+            words += [f"checkpoint={Trained(cell.method, cell.R, cell.seed).folder}", f"planner.candidates={cell.K}"]
+        folder = RUNS / "played" / "-".join(str(part) for part in cell if part is not None)
+        episodes = evaluate(folder, *words)["occupancy"]["per_episode"]
+        append_rows(EPISODES, [{**cell._asdict(), "occupancies": " ".join(f"{x:.4g}" for x in episodes)}])
+
+
+def curve(training: Trained) -> list[dict]:
+    """Return the validations of a finished training."""
+    return [
+        {**training._asdict(), "frames": int(row["frames"]), "height": int(row["curriculum/level"]), "occupancy": value}
+        for row in read_csv(training.folder / "metrics.csv")
+        if (value := row.get("eval/occupancy")) is not None
+    ]
 
 
 def half_interval(values: np.ndarray) -> float:
@@ -121,25 +181,19 @@ def summary(seeds: list[list[float]]) -> dict:
     return {**counts, "mean": middle, "low": middle - half, "high": middle + half}
 
 
-def measure() -> list[dict]:
-    """Return a row for each cell, each difference to another method in the same episodes, and each validation."""
-    played: dict[Cell, list[list[float]]] = defaultdict(list)  # of each training seed, the occupancy of each episode
-    for cell in cells():
-        played[cell._replace(seed=None)].append(play(cell))
+def summaries() -> list[dict]:
+    """Return a row for each cell, of all training seeds, and one for its difference to each other method."""
+    seeds: dict[Cell, list[list[float]]] = defaultdict(list)  # of each training seed, the occupancy of each episode
+    for cell, episodes in played().items():
+        seeds[cell._replace(seed=None)].append(episodes)
     rows = []
-    for cell, seeds in played.items():
+    for cell, mine in seeds.items():
         same = {"method": cell.method, "R": cell.R, "tote": cell.tote, "K": cell.K}
-        rows.append({"kind": "played", **same, **summary(seeds)})
-        for other in played:
+        rows.append({**same, "versus": None, **summary(mine)})
+        for other in seeds:
             same_play = other.method != cell.method == "fcn4d" and other[1:3] == cell[1:3]
             if same_play and other.K in (None, cell.K):
-                rows.append({"kind": "difference", **same, "versus": other.method, **less(seeds, played[other])})
-    for (method, turns), training in TRAININGS.items():
-        for seed in range(training.seeds):
-            for point in read_csv(RUNS / f"{method}-R{turns}-{seed}" / "metrics.csv"):
-                if "eval/occupancy" in point:
-                    curve = {"kind": "curve", "method": method, "R": turns, "seed": seed, "frames": point["frames"]}
-                    rows.append(curve | {"height": point["curriculum/level"], "mean": point["eval/occupancy"]})
+                rows.append({**same, "versus": other.method, **less(mine, seeds[other])})
     return rows
 
 
@@ -150,8 +204,8 @@ def less(seeds: list[list[float]], others: list[list[float]]) -> dict:
 
 
 def found(rows: list[dict], **wanted) -> dict | None:
-    """Return the row of played episodes with these values; None without one."""
-    return next((r for r in rows if r["kind"] == "played" and all(r.get(key) == v for key, v in wanted.items())), None)
+    """Return the row with these values that is not a difference; None without one."""
+    return next((row for row in rows if not row["versus"] and all(row[key] == v for key, v in wanted.items())), None)
 
 
 def panels(count: int = 1, width: float = 8, height: float = 4.2, **shared):
@@ -217,17 +271,17 @@ def draw_joint_or_individual(rows: list[dict]) -> None:
     finish(figure, both[0], "joint_or_individual")
 
 
-def draw_learning(rows: list[dict]) -> None:
+def draw_learning() -> None:
     """Draw validations over frames, and the height of the tote in training, as the paper's Fig. 8."""
+    rows = [row for row in read_rows(CURVES) if row["R"] == "4"]
     figure = figure_of(8, 5.5)
     upper, lower = figure.subplots(2, sharex=True, height_ratios=[2.5, 1])
     for method in ("fcn4d", "individual_rl", "typical", "paper"):
         for seed in range(TRAININGS[method, 4].seeds):
-            line = [row for row in rows if (row["kind"], row.get("seed"), row["R"]) == ("curve", seed, 4)]
-            line = [row for row in line if row["method"] == method]
-            frames, label = [row["frames"] for row in line], None if seed else LABELS[method]
-            upper.plot(frames, [row["mean"] for row in line], color=STYLE[method], label=label, lw=1.5)
-            lower.step(frames, [row["height"] for row in line], color=STYLE[method], where="post", lw=1.5)
+            line = [row for row in rows if (row["method"], row["seed"]) == (method, str(seed))]
+            frames, label = [int(row["frames"]) for row in line], None if seed else LABELS[method]
+            upper.plot(frames, [float(row["occupancy"]) for row in line], color=STYLE[method], label=label, lw=1.5)
+            lower.step(frames, [int(row["height"]) for row in line], color=STYLE[method], where="post", lw=1.5)
     upper.set_ylabel("occupancy of the full tote\n6x6x5, R=4, validation")
     lower.set_ylabel("height of the\ntraining's tote")
     lower.set_xlabel("frames")
@@ -247,26 +301,27 @@ def draw_methods(rows: list[dict]) -> None:
 
 
 def main() -> None:
-    trainings = [(*key, seed) for key, training in TRAININGS.items() for seed in range(training.seeds)]
-    names = {"{}-R{}-{}".format(*key): key for key in trainings}
+    trainings = [Trained(*key, seed) for key, training in TRAININGS.items() for seed in range(training.seeds)]
+    names = {training.name: training for training in trainings}
     if unknown := [name for name in sys.argv[1:] if name not in names]:
         sys.exit(f"{unknown[0]}: expected names of {', '.join(names)}")
     named = [names[name] for name in sys.argv[1:]]
-    left = [key for key in named or trainings if not (RUNS / "{}-R{}-{}".format(*key) / "report.html").is_file()]
-    hours = sum(TRAININGS[key[:2]].hours for key in left)
+    drawn = {(row["method"], row["R"], row["seed"]) for row in read_rows(CURVES)}
+    left = [one for one in named or trainings if (one.method, str(one.R), str(one.seed)) not in drawn]
+    hours = sum(TRAININGS[one.method, one.R].hours for one in left)
     sys.stdout.write(f"{len(left)} trainings are left, about {hours:.0f} hours of one core.\n")
-    for key in left:
-        train(*key)
+    for training in left:
+        train(training)
+        play(training.cells())
+        append_rows(CURVES, curve(training))
     if named:
         return
-    rows = measure()
-    columns = [*dict.fromkeys(key for row in rows for key in row)]
-    RESULTS.mkdir(exist_ok=True)
-    with (RESULTS / "paper.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, columns, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows({key: round(v, 5) if isinstance(v, float) else v for key, v in row.items()} for row in rows)
-    for draw in (draw_candidates, draw_joint_or_individual, draw_learning, draw_methods):
+    play(untrained())
+    rows = summaries()
+    (RESULTS / "summary.csv").unlink(missing_ok=True)
+    append_rows(RESULTS / "summary.csv", rows)
+    draw_learning()
+    for draw in (draw_candidates, draw_joint_or_individual, draw_methods):
         draw(rows)
 
 
