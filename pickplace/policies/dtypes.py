@@ -14,5 +14,13 @@ def matrix_dtype(name: str, device: str) -> torch.dtype:
         return getattr(torch, name)
     if device == "cuda":
         return torch.bfloat16 if torch.cuda.is_bf16_supported() else torch.float32
-    able = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
-    return torch.bfloat16 if any(able.get(key) for key in ("amx_bf16", "avx512_bf16", "bf16")) else torch.float32
+    return torch.bfloat16 if has_matrix_unit() or _is_cpu_able("avx512_bf16") else torch.float32
+
+
+def has_matrix_unit() -> bool:
+    """Return whether the CPU has units for matrices of bfloat16, and not only for vectors, as AVX-512 has."""
+    return _is_cpu_able("amx_bf16") or _is_cpu_able("bf16")
+
+
+def _is_cpu_able(key: str) -> bool:
+    return hasattr(torch.cpu, "get_capabilities") and bool(torch.cpu.get_capabilities().get(key))
