@@ -24,10 +24,10 @@ from pickplace.runs.loggers import read_csv
 from pickplace.views.figures import COLOURS, figure_of
 
 RESULTS, RUNS = ROOT / "docs" / "results" / "paper", ROOT / "outputs" / "paper"
-EPISODES, CURVES = RESULTS / "episodes.csv", RESULTS / "curves.csv"
+EPISODES_FILE, CURVES_FILE = RESULTS / "episodes.csv", RESULTS / "curves.csv"
 SMALL, LARGE = ("6x6x5", "6x6x10", "10x10x5", "10x10x10"), ("30x30x5", "30x30x10")
 CANDIDATES = (1, 2, 3, 5, 10, 20, 50)
-MOST, MANY, FEW = 500, 100, 10  # numbers of episodes: where a tote takes a moment, seconds, or minutes
+QUICK_EPISODES, EPISODES, SLOW_EPISODES = 500, 100, 10  # where a tote takes a moment, seconds, or minutes
 
 
 class Training(NamedTuple):
@@ -75,8 +75,8 @@ class Cell(NamedTuple):
     @property
     def episodes(self) -> int:
         if self.tote in LARGE or self.method == "mcts":
-            return FEW
-        return MOST if self.tote == "6x6x5" else MANY
+            return SLOW_EPISODES
+        return QUICK_EPISODES if self.tote == "6x6x5" else EPISODES
 
 
 class Trained(NamedTuple):
@@ -130,7 +130,7 @@ def append_rows(path: Path, rows: Iterable[dict]) -> None:
 def played() -> dict[Cell, list[float]]:
     """Return the occupancy of each episode, by cell, of all that was played."""
     number = lambda text: int(text) if text else None  # noqa: E731
-    rows = read_rows(EPISODES)
+    rows = read_rows(EPISODES_FILE)
     cells = [Cell(row["method"], int(row["R"]), row["tote"], number(row["K"]), number(row["seed"])) for row in rows]
     return {cell: [float(x) for x in row["occupancies"].split()] for cell, row in zip(cells, rows, strict=True)}
 
@@ -155,7 +155,7 @@ def play(cells: Iterable[Cell]) -> None:
             words += [f"checkpoint={Trained(cell.method, cell.R, cell.seed).folder}", f"planner.candidates={cell.K}"]
         folder = RUNS / "played" / "-".join(str(part) for part in cell if part is not None)
         episodes = evaluate(folder, *words)["occupancy"]["per_episode"]
-        append_rows(EPISODES, [{**cell._asdict(), "occupancies": " ".join(f"{x:.4g}" for x in episodes)}])
+        append_rows(EPISODES_FILE, [{**cell._asdict(), "occupancies": " ".join(f"{x:.4g}" for x in episodes)}])
 
 
 def curve(training: Trained) -> list[dict]:
@@ -273,7 +273,7 @@ def draw_joint_or_individual(rows: list[dict]) -> None:
 
 def draw_learning() -> None:
     """Draw validations over frames, and the height of the tote in training, as the paper's Fig. 8."""
-    rows = [row for row in read_rows(CURVES) if row["R"] == "4"]
+    rows = [row for row in read_rows(CURVES_FILE) if row["R"] == "4"]
     figure = figure_of(8, 5.5)
     upper, lower = figure.subplots(2, sharex=True, height_ratios=[2.5, 1])
     for method in ("fcn4d", "individual_rl", "typical", "paper"):
@@ -306,14 +306,14 @@ def main() -> None:
     if unknown := [name for name in sys.argv[1:] if name not in names]:
         sys.exit(f"{unknown[0]}: expected names of {', '.join(names)}")
     named = [names[name] for name in sys.argv[1:]]
-    drawn = {(row["method"], row["R"], row["seed"]) for row in read_rows(CURVES)}
+    drawn = {(row["method"], row["R"], row["seed"]) for row in read_rows(CURVES_FILE)}
     left = [one for one in named or trainings if (one.method, str(one.R), str(one.seed)) not in drawn]
     hours = sum(TRAININGS[one.method, one.R].hours for one in left)
     sys.stdout.write(f"{len(left)} trainings are left, about {hours:.0f} hours of one core.\n")
     for training in left:
         train(training)
         play(training.cells())
-        append_rows(CURVES, curve(training))
+        append_rows(CURVES_FILE, curve(training))
     if named:
         return
     play(untrained())
