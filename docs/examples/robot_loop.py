@@ -25,12 +25,14 @@ def carry(robot, plan) -> str:
     return "placed"
 
 
-def pack(robot, planner, cell_size: float) -> None:
-    """Pack tote after tote until no item arrives."""
+def pack(robot, planner, cell_size: float, sizes=None) -> None:
+    """Pack tote after tote until no item arrives. ``sizes`` of all items tell two that touch from one; m."""
     bearing, placed, missed, refused = None, [], [], 0
     while True:
         try:
-            scene = Scene.from_images(planner.cell, *robot.look(), cell_size, tote_bearing=bearing, placed=placed)
+            scene = Scene.from_images(
+                planner.cell, *robot.look(), cell_size, sizes=sizes, tote_bearing=bearing, placed=placed
+            )
             plan, refused = planner.plan(scene, exclude=missed), 0
         except EmptyBinError:
             missed, refused = [], 0

@@ -88,7 +88,7 @@ class Plan:
     #: of the item that is taken, or that was chosen if rejected, from 0: in ``items``, or among the ascending labels
     item_number: int | None = None
     #: if stuck or impossible: a sentence for each item that the gripper cannot grip, wherever it lies; such as
-    #: "items[1]: the cup does not fit on this item; no pick takes it."
+    #: "items[1]: the cup does not fit on this item, with cells of 50 mm; no pick takes it."
     hints: list[str] = field(default_factory=list)
     #: the item at rest in the tote, in the tote's frame; ``h`` is the height of its top. For ``placed`` of the next
     #: scene; None without an action, or without ``cell_size``

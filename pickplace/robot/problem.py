@@ -110,8 +110,9 @@ class Problem(ABC):
     def hints(self) -> list[str]:
         """Return a sentence for each item that the gripper cannot grip, wherever it lies."""
         gripper, sides = self.cell.gripper, zip(*(part[0].tolist() for part in self.state.items[2:4]), strict=True)
+        scale = f", with cells of {1000 * self.side:g} mm" if self.boxes else ""
         return [
-            f"{name}: {gripper.misfit}; no pick takes it."
+            f"{name}: {gripper.misfit}{scale}; no pick takes it."
             for name, (w, d), inset in zip(self.names, sides, self.insets, strict=True)
             if not gripper.can_grip(w, d, inset)
         ]

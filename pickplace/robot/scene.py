@@ -11,6 +11,7 @@ from pickplace.robot.measure import ToteMap
 from pickplace.rules.cell import MAX_BIN_ITEMS, MAX_SIDE, CellSpec
 from pickplace.rules.maps import FAR
 
+CLEARANCE_PIXELS = 2  # least clearance around an item that a camera sees, in pixels
 MAX_VALUE = 1e3  # greatest coordinate of a box, m, its greatest yaw, degrees, and mass, kg
 #: Least values of a box's fields: lengths in metres, masses in kilograms.
 LEAST = {
@@ -134,10 +135,18 @@ class Scene:
             **settings: the other fields.
 
         Raises:
+            ValueError: for a ``clearance`` below two pixels: an edge is not seen more exactly.
             EmptyBinError: if the bin is seen, and nothing lies in it.
             DepthMapError: for an image that allows no plan; another image may do.
         """
         (over_bin, bin_image), (over_tote, tote_image) = bin_view, tote_view
+        pixel, clearance = max(over_bin.pixel(), over_tote.pixel()), settings.get("clearance", CLEARANCE)
+        number("clearance", clearance, 0, 0.1, "metres")
+        refuse_if(
+            clearance < CLEARANCE_PIXELS * pixel,
+            f"clearance={clearance:g}: a pixel shows {pixel:.4f} m of the floor; expected at least {CLEARANCE_PIXELS} "
+            f"pixels, {CLEARANCE_PIXELS * pixel:.4f} m, or a camera that is nearer or has more pixels.",
+        )
         greatest = tote_height if greatest_height is None else greatest_height
         return cls(
             over_bin.items(bin_image, cell, cell_size, labels, accuracy, sizes, greatest, bin_height),

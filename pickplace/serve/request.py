@@ -9,7 +9,7 @@ from typing_extensions import Self
 
 from pickplace.common.errors import sentence
 from pickplace.common.validate import at_most, number, refuse_any, refuse_if, reworded, without_twins
-from pickplace.robot.box import ACCURACY, CLEARANCE, Box
+from pickplace.robot.box import ACCURACY, CLEARANCE, Box, EmptyBinError
 from pickplace.serve.deadline import Deadline
 
 if TYPE_CHECKING:
@@ -217,7 +217,7 @@ class Answer(NamedTuple):
     """An answer to a request."""
 
     status: int  # HTTP status
-    reply: dict  # a plan, or ``{"error": ...}`` in one sentence; with the request's ``id``
+    reply: dict  # a plan, or ``{"error": ...}`` in one sentence, and ``empty_bin`` if so; with the request's ``id``
     text: str  # the reply as JSON
 
 
@@ -229,6 +229,7 @@ def solve(planner: "Planner", request: PlanRequest, reply: dict, deadline: Deadl
     except (ValueError, TimeoutError, FloatingPointError) as error:
         status = 422 if isinstance(error, ValueError) else 504 if isinstance(error, TimeoutError) else 500
         reply = {**{key: reply[key] for key in ("id",) if key in reply}, "error": sentence(error)}
+        reply |= {"empty_bin": True} if isinstance(error, EmptyBinError) else {}
         return Answer(status, reply, json.dumps(reply))
 
 

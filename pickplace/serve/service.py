@@ -17,7 +17,7 @@ from fastapi import Depends, FastAPI, Request
 from fastapi.exceptions import HTTPException, RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse, Response
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException as StarletteHTTPException
 from starlette.requests import ClientDisconnect
 
@@ -41,6 +41,7 @@ class Refusal(BaseModel):
     """The reason for which a request has no plan, in one sentence."""
 
     error: str
+    empty_bin: bool = Field(False, description="Nothing lies in the bin: wait for items.")
     id: object = None
 
 

@@ -199,11 +199,13 @@ def test_a_scene_of_two_images():
     eyes = camera(BIN), camera()
     images = image(eyes[0], [box_of((0.1, 0.08, 0.06), 0.12, 0.1)], BIN), image(eyes[1], [])
     views = [*zip(eyes, images, strict=True)]
-    scene = Scene.from_images(CELL, *views, SIZE, 0.002, clearance=0.004, tote_height=0.2)
+    scene = Scene.from_images(CELL, *views, SIZE, 0.002, clearance=0.006, tote_height=0.2)
     assert scene.items == eyes[0].items(images[0], CELL, SIZE, accuracy=0.002)
     assert all(map(np.array_equal, scene.tote, eyes[1].tote_map(images[1], CELL, SIZE, 0.2)))
-    assert (scene.cell_size, scene.accuracy, scene.clearance, scene.tote_height) == (SIZE, 0.002, 0.004, 0.2)
+    assert (scene.cell_size, scene.accuracy, scene.clearance, scene.tote_height) == (SIZE, 0.002, 0.006, 0.2)
     assert Planner(CELL, planner="joint_dbl").plan(scene).status == "ok"
+    with pytest.raises(ValueError, match="^clearance=0.004: a pixel shows 0.0024 m of the floor; expected at least 2 "):
+        Scene.from_images(CELL, *views, SIZE, clearance=0.004)
     with pytest.raises(DepthMapError, match="labels: got shape"):
         Scene.from_images(CELL, *views, SIZE, labels=np.zeros((3, 3)))
     with pytest.raises(DepthMapError, match="is no item of the given sizes"):

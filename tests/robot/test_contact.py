@@ -66,14 +66,14 @@ def test_a_plan_says_on_which_items_the_cup_does_not_fit():
     planner = Planner(WIDE, planner="joint_dbl")
     plan = plan_for(planner, items=[SMALL], **EMPTY)
     assert plan.status == "impossible"
-    assert plan.hints == ["items[0]: the cup does not fit on this item; no pick takes it."]
+    assert plan.hints == ["items[0]: the cup does not fit on this item, with cells of 20 mm; no pick takes it."]
     full = {**EMPTY, "tote_depth": np.full((100, 75), 0.01)}
     plan = plan_for(planner, items=[LARGE, SMALL], **full)
     assert plan.status == "stuck"
-    assert plan.hints == ["items[1]: the cup does not fit on this item; no pick takes it."]
+    assert plan.hints == ["items[1]: the cup does not fit on this item, with cells of 20 mm; no pick takes it."]
     plate = Planner(CellSpec(bin_size=(6, 6, 1)), planner="joint_dbl")
     plan = plan_for(plate, items=[Box(0.15, 0.15, 0.16, 0.1, 0.06)], tote_depth=np.full((30, 30), 0.25), cell_size=CELL)
-    assert plan.hints == ["items[0]: the cup does not cover this item; no pick takes it."]
+    assert plan.hints == ["items[0]: the cup does not cover this item, with cells of 50 mm; no pick takes it."]
     depth = np.zeros((6, 6), dtype=int)
     depth[:4, :2] = 1
     for labels, name in ((None, "bin_depth"), (7 * depth, "bin_depth with label 7")):

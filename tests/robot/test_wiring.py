@@ -158,7 +158,7 @@ def test_one_camera_sees_both():
     # Both rooms in one image: the nearer surface counts where both draw one.
     item = box_of((0.1, 0.08, 0.06), 0.12, 0.13, 20)
     both = np.minimum(image(over_bin, [item], BIN), image(over_tote, []))
-    scene = Scene.from_images(CELL, (over_bin, both), (over_tote, both), SIZE)
+    scene = Scene.from_images(CELL, (over_bin, both), (over_tote, both), SIZE, clearance=0.0075)
     (box,) = scene.items
     assert (box.x, box.y, box.h) == pytest.approx((0.12, 0.13, 0.06), abs=0.003)
     assert DBL.plan(scene).status == "ok"

@@ -99,6 +99,7 @@ def test_command_answers_json_lines_and_survives_bad_ones(command):
     for reply, (_, expected) in zip(replies, lines, strict=True):
         assert ("error" in reply) == (expected is not None) and (expected or "") in reply.get("error", ""), reply
     assert [reply.get("id") for reply in replies] == [None] * 8 + [request.get("id") for request, _ in requests]
+    assert [reply["id"] for reply in replies if reply.get("empty_bin")] == [9]
     first, *_, stuck, last = replies[8:]
     assert stuck["status"] == "stuck" and sum(stuck["reasons"].values()) == 3600
     assert {**first, "id": 0} == {**last, "id": 0} and first["status"] == "ok"
