@@ -17,6 +17,7 @@ help:  ## list the targets
 install: $(STAMP)  ## create .venv and install the package with its development tools (LOCK=.ci/requirements.lock: locked versions)
 
 $(STAMP): pyproject.toml $(LOCK)
+	@echo "Installing into .venv takes a few minutes."
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --disable-pip-version-check $(if $(LOCK),-c $(LOCK)) -e '.[dev]'
 	@touch $@

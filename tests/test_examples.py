@@ -198,6 +198,7 @@ def test_own_gripper(example, tmp_path):
 
 
 ALGORITHMS = {
+    "own_algorithm_ppo": ["algo=ppo_entropy"],
     "own_algorithm_reinforce": ["algo=reinforce"],
     "own_algorithm_dqn": ["algo=dqn", "model.critic=null", "algo.capacity=100", "algo.minibatch_size=16"],
 }

@@ -74,6 +74,15 @@ SCRIPTS = {
 }  # fmt: skip
 
 
+def test_a_level_without_a_finished_episode_is_warned_of(caplog):
+    curriculum = make(Frames(100))
+    play(curriculum, 90, [0.5])
+    play(curriculum, 100)
+    assert (curriculum.level, caplog.text) == (2, "")
+    play(curriculum, 200, [0.5], height=1)
+    assert curriculum.level == 3 and "no episode at tote height 2 has ended" in caplog.text
+
+
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_levels_follow_the_rule(name):
     rule, heights, batches, levels = SCRIPTS[name]

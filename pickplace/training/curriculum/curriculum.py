@@ -1,5 +1,6 @@
 """The curriculum of a run: its level, its counts, and their state in a checkpoint."""
 
+import logging
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -14,6 +15,8 @@ from pickplace.rules.cell import CellSpec
 from pickplace.training.curriculum.advance import Advance, NoAdvance, Tally
 from pickplace.training.curriculum.levels import heights, read_levels
 from pickplace.training.curriculum.sample import Current
+
+log = logging.getLogger(__name__)
 
 
 class Curriculum:
@@ -171,6 +174,9 @@ class Curriculum:
             **{f"occupancy_at_{number}": mean for number, mean in means.items()},
         }
         if level != tally.level:
+            if not (tally.episodes or self.weights):
+                key, at = "a smaller env.num_envs", f"{self.what} {tally.level}"
+                log.warning("no episode at %s has ended; expected more frames for it, or %s", at, key)
             self.tally = Tally(level, deque(maxlen=self.advance.window), frames, level_start=frames)
         return {f"curriculum/{key}": value for key, value in logs.items()}
 
