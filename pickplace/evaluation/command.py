@@ -36,7 +36,8 @@ def merge_trained(cfg: DictConfig, trained: DictConfig) -> DictConfig:
     Raises:
         ValueError: for overrides that do not fit it.
     """
-    groups = OmegaConf.create({key: OmegaConf.to_container(cfg[key], resolve=True) for key in ("env", "items")})
+    # References such as ${env.cell_size} must lead to the checkpoint's env.
+    groups = OmegaConf.create({key: OmegaConf.to_container(cfg[key], resolve=False) for key in ("env", "items")})
     ours, changed = [], trained.copy()
     for word in task_overrides():
         key, _, option = word.lstrip("+~").partition("=")

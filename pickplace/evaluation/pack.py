@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pickplace.common.validate import refuse_any, refuse_if, reworded, whole_number
-from pickplace.config.registry import find
+from pickplace.config.registry import find, names_at
 from pickplace.items.order_file import ORIENTATIONS, TURNS, OrderItem
 from pickplace.planners.base import MapPlanner
 from pickplace.rules.cell import MAX_CELLS, MAX_SIDE, CellSpec
@@ -99,13 +99,13 @@ class OrderPacker:
     allows, and no item carries more than it bears: the full mass of an item counts on each one below it in the pile.
 
     Args:
-        container: length, width and height, mm.
+        container: length, width and height, mm; what whole cells leave of length and width stays empty.
         cell: side of a cell of the grid, mm, at most :data:`MAX_CELL`.
         planner: name of the planner that chooses places, such as ``"joint_dbl"``; it must need no training.
         tipping: whether to put items down on another side, too, if they allow it.
 
     Raises:
-        ValueError: for a container that the grid does not divide, or a planner that does not choose among places.
+        ValueError: for a container smaller than a cell, or a planner that does not choose among places.
     """
 
     def __init__(
@@ -118,10 +118,7 @@ class OrderPacker:
         whole_number("cell", cell, most=MAX_CELL)
         self._faces = FACES if tipping else FACES[:1]
         self.container, self.cell_mm, size = container, cell, "x".join(map(str, container))
-        refuse_any(
-            (side for side in container[:2] if side % cell),
-            lambda _: f"container={size}: expected a length and a width that are multiples of cell={cell} mm.",
-        )
+        refuse_if(min(container[:2]) < cell, f"container={size}: expected a length and a width of at least {cell} mm.")
         refuse_if(
             not 1 <= container[2] <= MAX_SIDE,
             f"container={size}: expected a height of 1 to {MAX_SIDE:,} mm.",
@@ -129,11 +126,11 @@ class OrderPacker:
         self._settings: dict[str, Any] = {
             "gripper": Overlap(size=(1, 1)), "rotations": 2, "height_unit": 1 / cell, "cell_size": cell / 1000,
         }  # fmt: skip
+        names = [name for name in names_at("planner") if _packs(find("planner", name))]
+        expected = f"planner={planner}: expected {', '.join(names)}, or a class of your own that needs no training."
+        refuse_if("." not in planner and planner not in names, expected)
         self._make, self._name = find("planner", planner), planner
-        refuse_if(
-            not isinstance(self._make, type) or not issubclass(self._make, MapPlanner) or hasattr(self._make, "needs"),
-            f"planner={planner}: expected one that needs no training, such as joint_dbl.",
-        )
+        refuse_if(not _packs(self._make), expected)
 
     def pack(self, items: Sequence[OrderItem], keep_sequence: bool = False) -> tuple[CellSpec, list[PackedContainer]]:
         """Return the cell and the containers that hold all items, as many as are needed.
@@ -291,6 +288,11 @@ class OrderPacker:
         fill.recording.ending = Failure.STUCK if fill.left else Failure.NONE
         fill.recording.occupancy = sum(math.prod(each.size) for each in fill.items) / math.prod(self.container)
         return PackedContainer(fill.items, fill.recording), fill.left
+
+
+def _packs(planner: Any) -> bool:
+    """Return whether a class of planners chooses among places, and needs nothing but the cell."""
+    return isinstance(planner, type) and issubclass(planner, MapPlanner) and not hasattr(planner, "needs")
 
 
 @dataclass

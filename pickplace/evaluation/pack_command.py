@@ -55,7 +55,7 @@ def parser() -> argparse.ArgumentParser:
             },
             "--planner": {
                 "metavar": "NAME", "default": "heightmap_minimisation",
-                "help": "what chooses the places, such as joint_dbl (default %(default)s)",
+                "help": "what chooses the places: best_fit, corner, joint_dbl, ... (default %(default)s)",
             },
             "--out": {
                 "metavar": "FOLDER", "default": "outputs/pack", "help": "where the files go (default %(default)s)",

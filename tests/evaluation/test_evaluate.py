@@ -16,7 +16,7 @@ from untrained import write_checkpoint
 from pickplace import CellSpec, PickPlaceEnv
 from pickplace.config.registry import build
 from pickplace.evaluation.artifacts import evaluation_table
-from pickplace.evaluation.evaluate import prepare
+from pickplace.evaluation.evaluate import load_trained, prepare
 from pickplace.evaluation.play import play
 from pickplace.evaluation.result import episode_settings, read_comparison
 from pickplace.physics.plans import read_plans
@@ -90,6 +90,14 @@ def test_larger_benchmarks_are_gopt_rs_on_a_finer_grid(side, episodes):
     assert cfg.env.tote_size == [side] * 3 and cfg.env.bin_size == [5 * scale, 5 * scale, 1]
     assert {**cfg.env, "tote_size": 0, "bin_size": 0} == {**small.env, "tote_size": 0, "bin_size": 0}
     assert cfg.evaluation.episodes == episodes
+
+
+def test_orders_with_a_checkpoint_have_its_cells():
+    words = ["checkpoint=pretrained/warehouse", "items=orders", "items.path=docs/examples/orders/orders.csv"]
+    for extra, expected in ([], (0.02, 0.25)), (["env.cell_size=0.03", "items.height_unit=0.5"], (0.03, 0.5)):
+        with evaluation_config(*words, *extra) as cfg:
+            load_trained(cfg)
+        assert (cfg["items"].cell_size, cfg["items"].height_unit) == expected
 
 
 @pytest.mark.parametrize(
