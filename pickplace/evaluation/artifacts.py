@@ -94,7 +94,9 @@ def evaluation_table(result: dict) -> str:
         and _interval(true, ".4f"),
         "items placed": f"{result['items_placed']:.1f} an episode",
         "share of an episode's items": "share_placed" in result and _interval(result["share_placed"], ".4f"),
-        "episodes ended by": ", ".join(f"{name} {count}" for name, count in result["failures"].items()),
+        "episodes ended by": ", ".join(
+            f"{'no more items' if name == 'none' else name} {count}" for name, count in result["failures"].items()
+        ),
         "feasible actions": f"{result['feasible_action_share']:.2%} of all, mean over decisions",
         f"physics, {physics and physics['method']}": physics
         and _interval(physics["carried_out"], ".1%", " of the episodes to their end"),
