@@ -12,13 +12,12 @@ import sys
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 import pickplace
 from pickplace import Planner, Scene
-from pickplace.config.composition import conf_dir
+from pickplace.config.composition import compose_job, config_files
 from pickplace.config.registry import build
 from pickplace.evaluation import pack_command
 from pickplace.physics import command as physics
@@ -93,8 +92,8 @@ def commands_of(text):
 @functools.cache
 def check_command(command, search, words, is_new):
     """Compose the config of a command, and check that a new training's curriculum can reach its end."""
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        cfg = compose(command, [*search, *words])
+    with config_files():
+        _, cfg = compose_job(command, [*search, *words])
     if command == "train" and is_new:
         items, curriculum = build("items", cfg["items"]), build("curriculum", cfg.curriculum)
         curriculum.setup(build_cell(OmegaConf.to_container(cfg.env, resolve=True)), items, cfg.total_frames)
