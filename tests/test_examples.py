@@ -3,8 +3,10 @@
 import ast
 import csv
 import importlib
+import itertools
 import json
 import math
+import runpy
 import shutil
 import signal
 from pathlib import Path
@@ -23,6 +25,7 @@ from pickplace.algorithms.base import At, Task
 from pickplace.config.composition import conf_dir
 from pickplace.config.registry import build
 from pickplace.items.distributions import Kinds
+from pickplace.items.order_file import OrderItem
 from pickplace.physics.plans import EpisodePlan, Placement
 from pickplace.policies.fcn_grasp.policy import FcnGrasp
 from pickplace.rules.observation import STANDARD_TERMS
@@ -433,3 +436,26 @@ def test_quickstart_notebook_in_jupyter(tmp_path):
     executed = nbformat.read(NOTEBOOK, as_version=4)
     nbclient.NotebookClient(executed, timeout=300, kernel_name="python3").execute(cwd=tmp_path)
     assert_shown(executed)
+
+
+def test_an_order_list_becomes_picks_and_places(capsys, monkeypatch):
+    """The items lie apart in the tote; one that the cup does not fit on is named, and the next one is planned."""
+    script = runpy.run_path(str(EXAMPLES / "order_to_robot.py"))
+    planner = Planner.load("pretrained/warehouse", tote_size=(20, 15, 30), **script["CUP"])
+    sides = [(90, 60, 140), (62, 48, 30), (140, 90, 45), (140, 90, 45), (120, 100, 100), (95, 60, 80)]
+    items = [OrderItem(str(n), *map(float, each), 500, f"line {n}") for n, each in enumerate(sides)]
+    plans = [plan for _, plan in script["plan_order"](planner, items)]
+    assert [plan.status for plan in plans] == ["ok", "impossible", *["ok"] * 4]
+    assert "items[0]: the cup does not fit" in script["row_of"]("7", items[1], plans[1])["reason"]
+    row = script["row_of"]("7", items[0], plans[0])
+    assert row["pick_z/mm"] == 143 and row["place_z/mm"] == 146 and row["fill"] == "4.2%"
+    boxes = []
+    for plan in plans:
+        if plan.status == "ok":
+            at = plan.placed
+            low = np.array([at.x - at.w / 2, at.y - at.d / 2, plan.drop_height])
+            high = np.array([at.x + at.w / 2, at.y + at.d / 2, at.h])
+            assert (low >= 0).all() and (high <= (0.4, 0.3, 0.15)).all()
+            boxes.append((low, high))
+    for (low, high), (other_low, other_high) in itertools.combinations(boxes, 2):
+        assert (np.minimum(high, other_high) - np.maximum(low, other_low)).min() <= 1e-9

@@ -332,7 +332,7 @@ def test_a_second_container_takes_what_is_left(pack, tmp_path):
         (["--container", "15x300x250"], "container=15x300x250: expected a length and a width of at least 20 mm."),
         (["--container", "4000x4000x250", "--cell", "2000"], "cell=2000: expected a whole number >= 1 and <= 1,000."),
         (["--container", "100x100x250"], "orders.csv, line 4: 140 x 90 x 45 mm; expected an item that fits the"),
-        (["--container", "400x300x250", "--planner", "policy"], "planner=policy: expected joint_dbl, corner, best_fit, online_bph, heightmap"),
+        (["--container", "400x300x250", "--planner", "policy"], "planner=policy: expected joint_dbl, corner, best_fit"),
         (["--container", "400x300x250", "--planner", "jointdbl"], "planner=jointdbl: expected joint_dbl, corner, "),
         (["--container", "400x300x250", "--planner", "test_pack.ORDERS"], "test_pack.ORDERS: there is no such class"),
         (["--container", "400x300x250", "--unit", "inch"], "--unit='inch': expected 'mm'"),
