@@ -2,11 +2,13 @@
 
 Trains with three seeds and plays the test stream. docs/results/paper keeps what was measured: the occupancy of each
 episode (episodes.csv) and the learning curves (curves.csv), from which a table (summary.csv) and figures are made.
-What these files have is not measured again: without them everything is. A stopped training in outputs/paper goes on.
+What these files have is not measured again. To measure everything again, remove docs/results/paper/*.csv and
+outputs/paper, which has the run folders: stopped trainings there go on, and finished ones are not repeated.
 ``python benchmarks/paper.py fcn4d-R4-0`` trains and plays only this, so that several processes can share the work.
 """
 
 import csv
+import fcntl
 import io
 import sys
 from collections import defaultdict
@@ -79,8 +81,8 @@ class Cell(NamedTuple):
         return QUICK_EPISODES if self.tote == "6x6x5" else EPISODES
 
 
-class Trained(NamedTuple):
-    """One training."""
+class Run(NamedTuple):
+    """A training with one seed."""
 
     method: str
     R: int
@@ -102,7 +104,7 @@ class Trained(NamedTuple):
                 yield from (Cell(self.method, self.R, tote, k, self.seed) for k in every)
 
 
-def untrained() -> Iterator[Cell]:
+def heuristic_cells() -> Iterator[Cell]:
     """Yield what the methods that are not trained play."""
     for method, turns, tote in product(("joint_dbl", "individual_heuristic"), (3, 4), SMALL + LARGE):
         yield Cell(method, turns, tote)
@@ -115,19 +117,19 @@ def read_rows(path: Path) -> list[dict[str, str]]:
 
 
 def append_rows(path: Path, rows: Iterable[dict]) -> None:
-    """Add rows to a file in one write, as several processes may do so; a new file begins with its columns' names."""
-    text = io.StringIO()
-    for row in rows:
-        writer = csv.DictWriter(text, row, lineterminator="\n")
-        if not path.is_file() and not text.tell():
-            writer.writeheader()
-        writer.writerow({key: round(v, 5) if isinstance(v, float) else v for key, v in row.items()})
+    """Add rows to a file, to which other processes may add some, too; a new file begins with its columns' names."""
     RESULTS.mkdir(exist_ok=True)
-    with path.open("a") as file:
-        file.write(text.getvalue())
+    with path.open("a", newline="") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        for row in rows:
+            writer = csv.DictWriter(file, row, lineterminator="\n")
+            if file.seek(0, io.SEEK_END) == 0:
+                writer.writeheader()
+            writer.writerow({key: round(v, 5) if isinstance(v, float) else v for key, v in row.items()})
+            file.flush()
 
 
-def played() -> dict[Cell, list[float]]:
+def read_episodes() -> dict[Cell, list[float]]:
     """Return the occupancy of each episode, by cell, of all that was played."""
     number = lambda text: int(text) if text else None  # noqa: E731
     rows = read_rows(EPISODES_FILE)
@@ -135,34 +137,34 @@ def played() -> dict[Cell, list[float]]:
     return {cell: [float(x) for x in row["occupancies"].split()] for cell, row in zip(cells, rows, strict=True)}
 
 
-def train(training: Trained) -> None:
+def train(one: Run) -> None:
     """Train, or go on with a training, unless it is finished."""
-    if not (training.folder / "report.html").is_file():
-        words = TRAININGS[training.method, training.R].words.split()
-        new = [*words, f"seed={training.seed}", f"hydra.run.dir={training.folder}"]
-        stopped = (training.folder / "checkpoints").is_dir()
-        run("pickplace-train", *([f"resume={training.folder}"] if stopped else new), "threads=1")
+    if not (one.folder / "report.html").is_file():
+        words = TRAININGS[one.method, one.R].words.split()
+        new = [*words, f"seed={one.seed}", f"hydra.run.dir={one.folder}"]
+        stopped = (one.folder / "checkpoints").is_dir()
+        run("pickplace-train", *([f"resume={one.folder}"] if stopped else new), "threads=1")
 
 
 def play(cells: Iterable[Cell]) -> None:
     """Play the test stream in each cell, unless it was played."""
-    for cell in [cell for cell in cells if cell not in played()]:
+    for cell in [cell for cell in cells if cell not in read_episodes()]:
         words = [f"env.tote_size=[{cell.tote.replace('x', ',')}]", f"evaluation.episodes={cell.episodes}"]
         words += ["evaluation.batch_size=50", "evaluation.latency_decisions=0"]
         if cell.seed is None:
             words += ["env=paper", f"env.rotations={cell.R}", f"planner={cell.method}"]
         else:
-            words += [f"checkpoint={Trained(cell.method, cell.R, cell.seed).folder}", f"planner.candidates={cell.K}"]
+            words += [f"checkpoint={Run(cell.method, cell.R, cell.seed).folder}", f"planner.candidates={cell.K}"]
         folder = RUNS / "played" / "-".join(str(part) for part in cell if part is not None)
         episodes = evaluate(folder, *words)["occupancy"]["per_episode"]
         append_rows(EPISODES_FILE, [{**cell._asdict(), "occupancies": " ".join(f"{x:.4g}" for x in episodes)}])
 
 
-def curve(training: Trained) -> list[dict]:
+def curve(one: Run) -> list[dict]:
     """Return the validations of a finished training."""
     return [
-        {**training._asdict(), "frames": int(row["frames"]), "height": int(row["curriculum/level"]), "occupancy": value}
-        for row in read_csv(training.folder / "metrics.csv")
+        {**one._asdict(), "frames": int(row["frames"]), "height": int(row["curriculum/level"]), "occupancy": value}
+        for row in read_csv(one.folder / "metrics.csv")
         if (value := row.get("eval/occupancy")) is not None
     ]
 
@@ -183,24 +185,26 @@ def summary(seeds: list[list[float]]) -> dict:
 
 def summaries() -> list[dict]:
     """Return a row for each cell, of all training seeds, and one for its difference to each other method."""
-    seeds: dict[Cell, list[list[float]]] = defaultdict(list)  # of each training seed, the occupancy of each episode
-    for cell, episodes in played().items():
-        seeds[cell._replace(seed=None)].append(episodes)
+    seeds: dict[Cell, dict[int | None, list[float]]] = defaultdict(dict)  # the occupancies of each training seed
+    for cell, episodes in sorted(read_episodes().items(), key=str):
+        seeds[cell._replace(seed=None)][cell.seed] = episodes
     rows = []
-    for cell, mine in seeds.items():
-        same = {"method": cell.method, "R": cell.R, "tote": cell.tote, "K": cell.K}
-        rows.append({**same, "versus": None, **summary(mine)})
-        for other in seeds:
-            same_play = other.method != cell.method == "fcn4d" and other[1:3] == cell[1:3]
-            if same_play and other.K in (None, cell.K):
-                rows.append({**same, "versus": other.method, **less(mine, seeds[other])})
+    for cell, by_seed in seeds.items():
+        setting = {"method": cell.method, "R": cell.R, "tote": cell.tote, "K": cell.K}
+        rows.append({**setting, "versus": None, **summary([*by_seed.values()])})
+        for other, theirs in seeds.items():
+            is_pair = other.method != cell.method == "fcn4d" and other[1:3] == cell[1:3]
+            if is_pair and other.K in (None, cell.K) and (pairs := paired(by_seed, theirs)):
+                rows.append({**setting, "versus": other.method, **summary(pairs)})
     return rows
 
 
-def less(seeds: list[list[float]], others: list[list[float]]) -> dict:
-    """Return the difference of two methods in the same episodes, seed by seed; a single seed is paired with all."""
-    others = others * len(seeds) if len(others) == 1 else others
-    return summary([[a - b for a, b in zip(*pair, strict=False)] for pair in zip(seeds, others, strict=False)])
+def paired(seeds: dict, others: dict) -> list[list[float]]:
+    """Return the differences of two methods in the same episodes, for each training seed that both have. A method with
+    a single seed, or without training, is paired with all."""
+    only = next(iter(others.values())) if len(others) == 1 else None
+    pairs = [(mine, others.get(seed, only)) for seed, mine in seeds.items()]
+    return [[a - b for a, b in zip(*pair, strict=False)] for pair in pairs if pair[1] is not None]
 
 
 def found(rows: list[dict], **wanted) -> dict | None:
@@ -301,22 +305,23 @@ def draw_methods(rows: list[dict]) -> None:
 
 
 def main() -> None:
-    trainings = [Trained(*key, seed) for key, training in TRAININGS.items() for seed in range(training.seeds)]
-    names = {training.name: training for training in trainings}
+    every = [Run(*key, seed) for key, training in TRAININGS.items() for seed in range(training.seeds)]
+    names = {each.name: each for each in every}
     if unknown := [name for name in sys.argv[1:] if name not in names]:
         sys.exit(f"{unknown[0]}: expected names of {', '.join(names)}")
     named = [names[name] for name in sys.argv[1:]]
-    drawn = {(row["method"], row["R"], row["seed"]) for row in read_rows(CURVES_FILE)}
-    left = [one for one in named or trainings if (one.method, str(one.R), str(one.seed)) not in drawn]
-    hours = sum(TRAININGS[one.method, one.R].hours for one in left)
+    finished = {Run(row["method"], int(row["R"]), int(row["seed"])) for row in read_rows(CURVES_FILE)}
+    left = [each for each in named or every if each not in finished]
+    hours = sum(TRAININGS[each.method, each.R].hours for each in left)
     sys.stdout.write(f"{len(left)} trainings are left, about {hours:.0f} hours of one core.\n")
-    for training in left:
-        train(training)
-        play(training.cells())
-        append_rows(CURVES_FILE, curve(training))
+    for each in left:
+        train(each)
+        append_rows(CURVES_FILE, curve(each))
+    for each in named or every:
+        play(each.cells())
     if named:
         return
-    play(untrained())
+    play(heuristic_cells())
     rows = summaries()
     (RESULTS / "summary.csv").unlink(missing_ok=True)
     append_rows(RESULTS / "summary.csv", rows)

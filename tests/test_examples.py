@@ -221,6 +221,8 @@ def test_own_algorithm(name, example, tmp_path):
     example("train", name, f"resume={folder}", f"trust={name}")
     assert_same(whole, folder)
     rows = read_csv(folder / "metrics.csv")
+    if name == "own_algorithm_ppo":
+        assert [row["train/entropy_coeff"] for row in rows] == pytest.approx([0.02, 0.016, 0.012, 0.008, 0.004])
     assert len({row.get("train/loss_objective", row.get("train/loss")) for row in rows}) == 5
     ours = example("evaluate", name, f"checkpoint={folder}", *EVALUATION)
     assert ours["planner"] == "policy" and ours["mask_in_training"] is True
@@ -438,20 +440,21 @@ def test_quickstart_notebook_in_jupyter(tmp_path):
     assert_shown(executed)
 
 
-def test_an_order_list_becomes_picks_and_places(capsys, monkeypatch):
-    """The items lie apart in the tote; one that the cup does not fit on is named, and the next one is planned."""
+def test_an_order_list_becomes_picks_and_places(capsys):
+    """The items lie apart in the tote; one that cannot be picked is named, and the next one is planned."""
     script = runpy.run_path(str(EXAMPLES / "order_to_robot.py"))
     planner = Planner.load("pretrained/warehouse", tote_size=(20, 15, 30), **script["CUP"])
-    sides = [(90, 60, 140), (62, 48, 30), (140, 90, 45), (140, 90, 45), (120, 100, 100), (95, 60, 80)]
+    sides = [(90, 60, 140), (62, 48, 30), (140, 90, 45), (320, 90, 45), (120, 100, 100), (95, 60, 80)]
     items = [OrderItem(str(n), *map(float, each), 500, f"line {n}") for n, each in enumerate(sides)]
     plans = [plan for _, plan in script["plan_order"](planner, items)]
-    assert [plan.status for plan in plans] == ["ok", "impossible", *["ok"] * 4]
-    assert "items[0]: the cup does not fit" in script["row_of"]("7", items[1], plans[1])["reason"]
-    row = script["row_of"]("7", items[0], plans[0])
+    rows = [script["row_of"]("7", *each) for each in zip(items, plans, strict=True)]
+    assert [row["status"] for row in rows] == ["ok", "impossible", "ok", "refused", "ok", "ok"]
+    assert "items[0]: the cup does not fit" in rows[1]["reason"] and "expected" in str(rows[3]["reason"])
+    row = rows[0]
     assert row["pick_z/mm"] == 143 and row["place_z/mm"] == 146 and row["fill"] == "4.2%"
     boxes = []
-    for plan in plans:
-        if plan.status == "ok":
+    for row, plan in zip(rows, plans, strict=True):
+        if row["status"] == "ok":
             at = plan.placed
             low = np.array([at.x - at.w / 2, at.y - at.d / 2, plan.drop_height])
             high = np.array([at.x + at.w / 2, at.y + at.d / 2, at.h])
@@ -459,3 +462,6 @@ def test_an_order_list_becomes_picks_and_places(capsys, monkeypatch):
             boxes.append((low, high))
     for (low, high), (other_low, other_high) in itertools.combinations(boxes, 2):
         assert (np.minimum(high, other_high) - np.maximum(low, other_low)).min() <= 1e-9
+    script["main"](EXAMPLES / "orders" / "orders.csv")
+    printed = [*csv.DictReader(capsys.readouterr().out.splitlines())]
+    assert len(printed) == 39 and {row["status"] for row in printed} == {"ok", "impossible"}

@@ -1,6 +1,7 @@
 """Plan picks and places for the items of an order list, which arrive one by one: python order_to_robot.py orders.csv
 
-Prints a CSV in millimetres. Items that find no place are listed with the reason, and the next ones are tried.
+Prints a CSV in millimetres. Items that find no place are listed with the reason, and the next ones are tried. The
+robot turns items about the vertical only; a column ``orientations`` is not read.
 """
 
 import csv
@@ -9,7 +10,7 @@ import sys
 
 import numpy as np
 
-from pickplace import Box, Planner, Scene
+from pickplace import Box, DepthMapError, Planner, Scene
 from pickplace.items.order_file import read_orders
 from pickplace.rules.item import NO_LIMIT
 
@@ -18,7 +19,7 @@ CUP = {"effector_size": (6, 6), "cup_size": (2, 2)}  # your gripper, in cells: a
 
 
 def plan_order(planner, items):
-    """Yield each item with its plan; what is carried out is written into the map of the tote."""
+    """Yield each item with its plan, or the error if it does not fit the bin; update the map of the tote."""
     wide, deep, high = planner.cell.tote_size
     height = high * planner.cell.height_unit * CELL
     free = np.full((round(wide * CELL / SQUARE), round(deep * CELL / SQUARE)), height)  # up to the rim
@@ -28,7 +29,11 @@ def plan_order(planner, items):
         w, d, h = (side / 1000 for side in (item.length, item.width, item.height))
         load = None if item.max_load == NO_LIMIT else item.max_load / 1000
         box = Box(x, y, w, d, h, mass=item.grams / 1000, max_load=load)
-        plan = planner.plan(Scene([box], free, CELL, placed=placed, tote_bearing=bearing), alternatives=0)
+        try:
+            plan = planner.plan(Scene([box], free, CELL, placed=placed, tote_bearing=bearing), alternatives=0)
+        except DepthMapError as error:
+            yield item, error
+            continue
         if plan.status == "ok":
             at = plan.placed
             along_x, along_y = (
@@ -42,6 +47,8 @@ def plan_order(planner, items):
 
 def row_of(order, item, plan):
     """Return a row of the table; the tool's positions are those of docs/robot.md."""
+    if isinstance(plan, DepthMapError):
+        return {"order": order, "id": item.id, "status": "refused", "reason": plan}
     row = {"order": order, "id": item.id, "status": plan.status}
     if plan.status == "ok":
         points = {"pick": plan.pick.center, "place": plan.place.center}

@@ -39,6 +39,7 @@ def merge_trained(cfg: DictConfig, trained: DictConfig) -> DictConfig:
     # References such as ${env.cell_size} must lead to the checkpoint's env.
     groups = OmegaConf.create({key: OmegaConf.to_container(cfg[key], resolve=False) for key in ("env", "items")})
     ours, changed = [], trained.copy()
+    changed.evaluation = cfg.evaluation
     for word in task_overrides():
         key, _, option = word.lstrip("+~").partition("=")
         if key == "benchmark":

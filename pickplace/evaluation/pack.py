@@ -99,7 +99,7 @@ class OrderPacker:
     allows, and no item carries more than it bears: the full mass of an item counts on each one below it in the pile.
 
     Args:
-        container: length, width and height, mm; what whole cells leave of length and width stays empty.
+        container: length, width and height, mm; a strip narrower than a cell at the far walls stays empty.
         cell: side of a cell of the grid, mm, at most :data:`MAX_CELL`.
         planner: name of the planner that chooses places, such as ``"joint_dbl"``; it must need no training.
         tipping: whether to put items down on another side, too, if they allow it.
@@ -126,11 +126,12 @@ class OrderPacker:
         self._settings: dict[str, Any] = {
             "gripper": Overlap(size=(1, 1)), "rotations": 2, "height_unit": 1 / cell, "cell_size": cell / 1000,
         }  # fmt: skip
-        names = [name for name in names_at("planner") if _packs(find("planner", name))]
-        expected = f"planner={planner}: expected {', '.join(names)}, or a class of your own that needs no training."
-        refuse_if("." not in planner and planner not in names, expected)
+        is_known = planner in names_at("planner") or "." in planner
+        if not is_known or not _packs(find("planner", planner)):
+            names = [name for name in names_at("planner") if _packs(find("planner", name))]
+            own = "a class of your own that needs no training"
+            raise ValueError(f"planner={planner}: expected {', '.join(names)}, or {own}.")
         self._make, self._name = find("planner", planner), planner
-        refuse_if(not _packs(self._make), expected)
 
     def pack(self, items: Sequence[OrderItem], keep_sequence: bool = False) -> tuple[CellSpec, list[PackedContainer]]:
         """Return the cell and the containers that hold all items, as many as are needed.

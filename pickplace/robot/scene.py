@@ -143,7 +143,7 @@ class Scene:
         pixel, clearance = max(over_bin.pixel(), over_tote.pixel()), settings.get("clearance", CLEARANCE)
         number("clearance", clearance, 0, 0.1, "metres")
         refuse_if(
-            clearance < CLEARANCE_PIXELS * pixel,
+            clearance < CLEARANCE_PIXELS * pixel - 1e-9,
             f"clearance={clearance:g}: a pixel shows {pixel:.4f} m of the floor; expected at least {CLEARANCE_PIXELS} "
             f"pixels, {CLEARANCE_PIXELS * pixel:.4f} m, or a camera that is nearer or has more pixels.",
         )

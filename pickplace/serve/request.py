@@ -217,7 +217,7 @@ class Answer(NamedTuple):
     """An answer to a request."""
 
     status: int  # HTTP status
-    reply: dict  # a plan, or ``{"error": ...}`` in one sentence, and ``empty_bin`` if so; with the request's ``id``
+    reply: dict  # a plan, or ``{"error": ...}`` in one sentence; with the request's ``id``
     text: str  # the reply as JSON
 
 

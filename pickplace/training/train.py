@@ -85,7 +85,7 @@ def _run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None)
         trainer.report(stop.signal is not None)
     if latest := trainer.latest:
         text = "validation occupancy %(occupancy).4f (95%% interval %(ci95_low).4f to %(ci95_high).4f)"
-        better = f"; that of checkpoints/best is {trainer.best:.4f}" if trainer.best > latest["occupancy"] else ""
+        better = f"; best checkpoint: {trainer.best:.4f}" if trainer.best > latest["occupancy"] else ""
         results.info(text + better, latest)
     results.info("run folder: %s", run_dir)
     if stop.signal:

@@ -144,15 +144,15 @@ def test_no_tiles_in_low_precision():
 
 @pytest.mark.parametrize(("unit", "by_tiles"), [("avx512_bf16", True), ("amx_bf16", False), ("bf16", False)])
 def test_tiles_in_float32_beat_vectors_of_bfloat16(monkeypatch, unit, by_tiles):
-    """Only where the network may choose; what it learns from stays in bfloat16."""
+    """Where the network may choose; a state's logits are the same alone and in a batch."""
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {unit: True}, raising=False)
     maps, model, low = depths((5, 5), (6, 6), batch=8), network(compute_dtype="auto"), network(compute_dtype="bfloat16")
-    assert model._dtype == torch.bfloat16
     with torch.no_grad():
         assert model._by_tiles(*model._prepare(*maps)) is by_tiles
         assert not low._by_tiles(*low._prepare(*maps))
         if by_tiles:
             assert_close(model(*maps), network()(*maps))
+            assert_close(torch.cat([model(*(each[row : row + 1] for each in maps)) for row in range(8)]), model(*maps))
 
 
 def test_rounding_of_tiles_is_small():

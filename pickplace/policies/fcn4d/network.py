@@ -9,7 +9,7 @@ The 4D convolutions are computed exactly, but without a 4D kernel:
   With pick x outermost in memory, before the batch, each tap's input is a contiguous slice and nothing is
   copied.
   A CPU without units for matrices of bfloat16 acts by :mod:`~pickplace.policies.fcn4d.winograd`, in float32: three
-  times as fast as these 3D convolutions in float32, and 1.6 times as fast as in bfloat16 by AVX-512.
+  times as fast as by these 3D convolutions in float32, and 1.6 times as fast as in AVX-512's bfloat16.
 * **Head.** ``1x1x1x1`` is a matrix product over the channels.
 * **Single pairs** of a pick and a place. Only the features that their logits see are computed, by matrix products with
   the whole kernel.
@@ -81,8 +81,8 @@ class Conv4dNet(nn.Module):
         tote_clip: ``H_1_max`` of eq. 4; None for no clipping, the "4D FCN" that the paper compares with.
         floor: least value of both clipped maps; None, as in the paper, for no floor.
         compute_dtype: dtype of the hidden activations: ``float32`` (strictly, the dtype of the parameters),
-            ``bfloat16``, or ``auto``: the fastest, which is bfloat16 where the device has units for it. Parameters,
-            head and logits stay float32.
+            ``bfloat16``, or ``auto``: bfloat16 where the device has units for matrices of it, which are 3 to 5 times as
+            fast. Parameters, head and logits stay float32.
         head_std: standard deviation of the head's initial weights; its bias is 0. If it is small, the policy
             starts near uniform. None: PyTorch's default.
         chunk_bytes: bytes of hidden activations held at a time without gradients. Large batches are cut along the
@@ -161,7 +161,7 @@ class Conv4dNet(nn.Module):
         """
         count = len(row)
         row, pick, place = (F.pad(index, (0, -count % PADDED_PAIRS)) for index in (row, pick, place))
-        maps = self._first_layer(*self._prepare(bin_depth, tote_depth), self._dtype)
+        maps = self._first_layer(*self._prepare(bin_depth, tote_depth))
         first = [part.permute(0, 2, 3, 1).flatten(0, 2) for part in maps]
         at_once = PAIRS_AT_ONCE[row.device.type]
         patches = _patches(bin_depth, row, pick).split(at_once), _patches(tote_depth, row, place).split(at_once)
@@ -208,7 +208,7 @@ class Conv4dNet(nn.Module):
 
     def _hidden(self, bins: Tensor, totes: Tensor) -> Tensor:
         """Return the second layer's activations, ``[W_B, N, D_B, W_T, D_T, C]``, of padded maps ``[N, ...]``."""
-        from_bin, from_tote = self._first_layer(bins, totes, self._dtype)
+        from_bin, from_tote = self._first_layer(bins, totes)
         from_tote = from_tote.permute(0, 2, 3, 1).contiguous()  # [N, W_T + 2, D_T + 2, filters]
         if bins.shape[1:] == (5, 5):
             return self._convolve_one_pick(from_bin.permute(0, 2, 3, 1).contiguous(), from_tote)
@@ -233,17 +233,14 @@ class Conv4dNet(nn.Module):
         memory."""
         if bins.device.type != "cpu" or torch.is_grad_enabled() or torch.is_autocast_enabled("cpu"):
             return False
-        precise = (torch.float32, torch.float64)  # in lower precision the transforms lose many digits
-        is_faster = self._dtype in precise or (self.compute_dtype == "auto" and not has_matrix_unit())
-        is_able = is_faster and self.second.weight.dtype in precise
-        return is_able and len(bins) * tile_count(*_sizes(bins, totes)) >= FEW_TILES
+        is_exact = self._dtype in (torch.float32, torch.float64)  # in lower precision the transforms lose many digits
+        return is_exact and len(bins) * tile_count(*_sizes(bins, totes)) >= FEW_TILES
 
     def _logits_by_tiles(self, bins: Tensor, totes: Tensor) -> Tensor:
         """Return `_logits` of padded maps by minimal filtering, up to rounding."""
         layer = SumConvolution(self.second.weight, *_sizes(bins, totes))
-        dtype = self.second.weight.dtype
-        tiles = layer.cut(*self._first_layer(bins, totes, dtype))
-        at_once = max(1, TILE_BYTES // (layer.tile_values() * self.filters * dtype.itemsize))
+        tiles = layer.cut(*self._first_layer(bins, totes))
+        at_once = max(1, TILE_BYTES // (layer.tile_values() * self.filters * self._dtype.itemsize))
         parts = [
             self._head(layer(*part).add_(self.second.bias).relu_())
             for part in zip(*(maps.split(at_once) for maps in tiles), strict=True)
@@ -252,15 +249,17 @@ class Conv4dNet(nn.Module):
 
     @property
     def _dtype(self) -> torch.dtype:
-        fast = matrix_dtype(self.compute_dtype, self.first.weight.device.type)
+        device = self.first.weight.device.type
+        by_vectors = self.compute_dtype == "auto" and device == "cpu" and not has_matrix_unit()
+        fast = matrix_dtype("float32" if by_vectors else self.compute_dtype, device)
         return self.first.weight.dtype if fast == torch.float32 else fast
 
-    def _first_layer(self, bins: Tensor, totes: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    def _first_layer(self, bins: Tensor, totes: Tensor) -> tuple[Tensor, Tensor]:
         """Return the bin's and the tote's part of the first layer, before its ReLU: ``[N, filters, W + 2, D + 2]``."""
         # The bin's channel is equal under all place taps, the tote's under all pick taps.
         from_bin = F.conv2d(bins[:, None], self.first.weight[:, 0].sum((3, 4))[:, None])
         from_tote = F.conv2d(totes[:, None], self.first.weight[:, 1].sum((1, 2))[:, None], self.first.bias)
-        return from_bin.to(dtype), from_tote.to(dtype)
+        return from_bin.to(self._dtype), from_tote.to(self._dtype)
 
     def _convolve_one_pick(self, from_bin: Tensor, from_tote: Tensor) -> Tensor:
         """Return the second layer for one pick cell: a 2D convolution, with the pick's taps as further channels.

@@ -175,8 +175,8 @@ class Curriculum:
         }
         if level != tally.level:
             if not (tally.episodes or self.weights):
-                key, at = "a smaller env.num_envs", f"{self.what} {tally.level}"
-                log.warning("no episode at %s has ended; expected more frames for it, or %s", at, key)
+                keys = "more frames for it (curriculum.advance), or a smaller env.num_envs"
+                log.warning("no episode at %s %d has ended; expected %s.", self.what, tally.level, keys)
             self.tally = Tally(level, deque(maxlen=self.advance.window), frames, level_start=frames)
         return {f"curriculum/{key}": value for key, value in logs.items()}
 
