@@ -21,7 +21,7 @@ from pickplace.robot.planner import Plan, Planner
 from pickplace.robot.scene import Scene
 
 CAMERA_HEIGHT = 1.2  # above the floors, m
-IMAGE = (240, 320)  # rows and columns of a depth image
+LEAST_ROWS = 240  # of a depth image
 RAY_LENGTH = 10.0  # m
 
 
@@ -66,9 +66,12 @@ class SimulatedCell:
         effector = tuple(np.multiply(cell.gripper.size, cell_size))
         plan = EpisodePlan(0, self.tote, self.bin, effector, body=body_of(cell))
         self.gantry: Gantry = self.simulation.make_scene(plan)
-        focal = 0.8 * IMAGE[0] * CAMERA_HEIGHT / (max(*self.bin[:2], *self.tote[:2]) + 0.1)
+        # The image shows more than the floors, as the rims are nearer. Its pixels are at most half the clearance wide.
+        shown = (max(*self.bin[:2], *self.tote[:2]) + 0.1) / 0.8
+        rows = max(LEAST_ROWS, math.ceil(2 * shown / clearance))
+        focal, image = CAMERA_HEIGHT * rows / shown, (rows, 4 * rows // 3)
         self.cameras = {
-            name: Camera.looking_down((sides[0] / 2, sides[1] / 2), CAMERA_HEIGHT, focal, IMAGE)
+            name: Camera.looking_down((sides[0] / 2, sides[1] / 2), CAMERA_HEIGHT, focal, image)
             for name, sides in (("bin", self.bin), ("tote", self.tote))
         }
 
@@ -131,8 +134,8 @@ class SimulatedCell:
         distance = np.zeros(count)
         arguments = (origin, directions.ravel(), None, 1, gantry.plate.id, hit, distance, None, count, RAY_LENGTH)
         mujoco.mj_multiRay(gantry.model, gantry.data, *arguments)
-        depth = np.where(hit >= 0, distance, np.nan).reshape(IMAGE) / length
-        return depth + self.draw.normal(0, self.noise, IMAGE)
+        depth = np.where(hit >= 0, distance, np.nan).reshape(length.shape) / length
+        return depth + self.draw.normal(0, self.noise, depth.shape)
 
     def arrive(self, size, centre, yaw: float) -> None:
         """Put an item into the bin, and let it come to rest."""

@@ -47,7 +47,9 @@ def test_a_policy_sees_what_comes():
     planner = Planner.load("pretrained/mixed", bin_size=(5, 5, 1), tote_size=(6, 6, 5), preview=3)
     torch.nn.init.normal_(planner.policy.network.waiting.sum.weight, std=1.0)
     coming = [Box(0.1, 0.1, 0.08, 0.04, 0.06, 30), Box(0.2, 0.1, 0.05, 0.05, 0.12)]
-    scene = {"items": [Box(0.1, 0.1, 0.09, 0.09, 0.05)], "tote_depth": np.full((30, 30), 0.25), "cell_size": 0.05}
+    free = np.full((30, 30), 0.25)
+    free[:15, :10] = 0.2  # so that not all corners are alike
+    scene = {"items": [Box(0.1, 0.1, 0.09, 0.09, 0.05)], "tote_depth": free, "cell_size": 0.05}
     seen = read_metric(planner.cell, Scene(scene["items"], scene["tote_depth"], 0.05, coming=coming), "cpu").seen
     assert seen.coming.table[0, :, 2:5].tolist() == [[2, 1, 1], [2, 2, 2]]
     asked = [plan_for(planner, **scene, coming=some).alternatives for some in (None, coming, coming[:1], coming[::-1])]
