@@ -64,7 +64,7 @@ class Orders(ItemDistribution):
         refuse_if(
             flag("items.split", split) and len(distinct) < 3,
             f"items.path={str(path)!r}: the file has {len(distinct)} different orders; expected three at least, for "
-            "train, validation and test, or items.split=false, by which all orders are for test.",
+            "train, validation and test, or items.split=false, which tests with all orders.",
         )
         at_most(f"items.path={str(path)!r}: the file has", len(kinds), "kinds of items", MAX_KINDS)
         self.sizes = torch.tensor([self.cells(item) for item in self._examples])
