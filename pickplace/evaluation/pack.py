@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import refuse_any, refuse_if, reworded, whole_number
+from pickplace.common.validate import refuse_if, reworded, whole_number
 from pickplace.config.registry import find, names_at
 from pickplace.items.order_file import ORIENTATIONS, TURNS, OrderItem
 from pickplace.planners.base import MapPlanner
@@ -189,17 +189,21 @@ class OrderPacker:
                 known |= new
         return variants
 
-    def _misfit(self, item: OrderItem) -> str:
+    def _misfit(self, items: Sequence[OrderItem]) -> str:
+        """Return the error for items that do not fit the container; it names the first one."""
+        item, more = items[0], len({each.place for each in items}) - 1
         sizes = " x ".join(f"{side:g}" for side in (item.length, item.width, item.height))
+        others = f", and {more} more line{'s' * (more > 1)} of this order" if more else ""
         ways = "turned or tipped" if len(self._faces) > 1 else "turned"
         return (
-            f"{item.place}: {sizes} mm; expected an item that fits the container of "
+            f"{item.place}: {sizes} mm{others}; expected an item that fits the container of "
             f"{' x '.join(map(str, self.container))} mm, in cells of {self.cell_mm} mm, as it lies or {ways}, where it "
             "allows that."
         )
 
     def _cell_for(self, items: Sequence[OrderItem]) -> CellSpec:
-        refuse_any((item for item in items if not self._variants(item, self._faces)), self._misfit)
+        if misfits := [item for item in items if not self._variants(item, self._faces)]:
+            raise ValueError(self._misfit(misfits))
         variants = [(item, *each) for item in items for each in self._variants(item, self._faces)]
         sides = [columns[:3] for _, _, columns in variants]
         # An item's true centre may be this much nearer to the edge of its support than the centre of its cells.

@@ -343,3 +343,9 @@ def test_a_second_container_takes_what_is_left(pack, tmp_path):
 def test_bad_words_are_refused_in_one_sentence(pack, words, message):
     err, _ = pack(ORDERS, *words, code=2)
     assert message in err and err.count("\n") == 1
+
+
+def test_the_lines_that_fit_no_container_are_counted(pack, tmp_path):
+    (path := tmp_path / "pallet.csv").write_text("l,w,h,kg,qty\n200,300,200,1,3\n700,100,30,1,2\n800,20,20,1,1\n")
+    err, _ = pack(path, "--container", "400x300x250", code=2)
+    assert "line 3: 700 x 100 x 30 mm, and 1 more line of this order; expected" in err
