@@ -136,10 +136,12 @@ def append_rows(path: Path, rows: Iterable[dict]) -> None:
 
 def read_episodes() -> dict[Cell, list[float]]:
     """Return the occupancy of each episode, by cell, of all that was played."""
-    number = lambda text: int(text) if text else None  # noqa: E731
-    rows = read_rows(EPISODES_FILE)
-    cells = [Cell(row["method"], int(row["R"]), row["tote"], number(row["K"]), number(row["seed"])) for row in rows]
-    return {cell: [float(x) for x in row["occupancies"].split()] for cell, row in zip(cells, rows, strict=True)}
+    episodes = {}
+    for row in read_rows(EPISODES_FILE):
+        candidates, seed = (int(row[key]) if row[key] else None for key in ("K", "seed"))
+        cell = Cell(row["method"], int(row["R"]), row["tote"], candidates, seed)
+        episodes[cell] = [float(x) for x in row["occupancies"].split()]
+    return episodes
 
 
 def train(one: Run) -> None:
@@ -153,7 +155,8 @@ def train(one: Run) -> None:
 
 def play(cells: Iterable[Cell]) -> None:
     """Play the test stream in each cell, unless it was played."""
-    for cell in [cell for cell in cells if cell not in read_episodes()]:
+    known = read_episodes()
+    for cell in [cell for cell in cells if cell not in known]:
         words = [f"env.tote_size=[{cell.tote.replace('x', ',')}]", f"evaluation.episodes={cell.episodes}"]
         words += ["evaluation.batch_size=50", "evaluation.latency_decisions=0"]
         if cell.seed is None:

@@ -144,7 +144,7 @@ def test_no_tiles_in_low_precision():
 
 @pytest.mark.parametrize(("unit", "by_tiles"), [("avx512_bf16", True), ("amx_bf16", False), ("bf16", False)])
 def test_tiles_in_float32_beat_vectors_of_bfloat16(monkeypatch, unit, by_tiles):
-    """Where the network may choose; a state's logits are the same alone and in a batch."""
+    """With ``auto`` only. Alone and in a batch, a state has the same logits."""
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {unit: True}, raising=False)
     maps, model, low = depths((5, 5), (6, 6), batch=8), network(compute_dtype="auto"), network(compute_dtype="bfloat16")
     with torch.no_grad():
