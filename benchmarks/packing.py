@@ -62,6 +62,8 @@ class Row(NamedTuple):
     def words(self) -> list[str]:
         """Return overrides of pickplace-evaluate."""
         weights = self.benchmark if self.benchmark in ("cdrl_rs", "cut1", "cut2") else "gopt_rs"
+        if self.benchmark == "gopt_rs" and self.effector in PLATES:
+            weights = self.effector
         learned = self.planner.startswith("learned")
         words = [f"benchmark={self.benchmark}", f"gripper={self.effector}", f"env.rotations={self.rotations}"]
         words += [f"checkpoint=pretrained/{weights}" if learned else "evaluation.episodes=300"]

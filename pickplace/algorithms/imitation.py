@@ -57,6 +57,10 @@ class WarmStart:
     ):
         self.frames, self.critic_frames = cfg.frames, cfg.critic_frames
         self.policy, self.cell, self.seed = policy, env.cell, seed
+        made_by = None if cfg.teacher is None else find("warm_start.teacher", cfg.teacher._target_)
+        is_used = cfg.frames > 0 and "policy" in getattr(made_by, "needs", ())
+        wanted = "null, or a teacher that follows a policy; the policy itself begins with warm_start.weights"
+        expect(is_used or cfg.checkpoint is None, "warm_start.checkpoint", cfg.checkpoint, wanted)
         if trained >= cfg.frames:
             return
         expect(cfg.teacher is not None, "warm_start.frames", cfg.frames, "0 without a teacher, or warm_start=imitate")
@@ -64,6 +68,7 @@ class WarmStart:
         if cfg.checkpoint is not None:
             state, facts = checkpoint.read(locate(cfg.checkpoint))
             trained_cfg = trusted_config(facts["config"], trust)
+            trained_cfg.device = str(env.device)  # not that of its own training
             teacher = (trained_cfg, state, cast(dict, OmegaConf.to_container(trained_cfg.env, resolve=True)))
         self._draws = "seed" in (accepted_arguments(find("warm_start.teacher", cfg.teacher._target_)) or cfg.teacher)
         self._settings = cast(dict, OmegaConf.to_container(cfg.teacher, resolve=True))

@@ -7,6 +7,7 @@ depend on the batch size, and every method that plays an episode gets the same i
 import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
+from inspect import signature
 from itertools import product
 from typing import Any
 
@@ -166,7 +167,7 @@ class ItemDistribution:
         Raises:
             ValueError: for a bad setting, or a distribution whose episodes cannot differ in their mix.
         """
-        raise ValueError(f"items: {type(self).__name__} has no mixes; expected items=kinds or items=uniform.")
+        raise ValueError(f"items: {type(self).__name__} has no mixes; expected items=kinds or items=mixed.")
 
     def arrives(self, mix: int = 0) -> Tensor:
         """Return a mask of the rows of ``sizes`` that may arrive in a mix, bool ``[K]``."""
@@ -245,6 +246,8 @@ class Kinds(ItemDistribution):
         Raises:
             ValueError: naming the setting.
         """
+        takes_mix = "mix" in signature(self.sample).parameters
+        expect(takes_mix, "items", type(self).__name__, "a class with sample(stream, ..., bin_size, mix=None)")
         share = torch.stack([self._share[0], *(self._share_of(change) for change in changes)])
         other = copy(self)
         other.mixes, other._share, other._edges = len(share), share, self._edges_of(share)
@@ -385,5 +388,5 @@ def search_items(items: ItemDistribution) -> ItemDistribution:
     if not items.sequential:
         return items
     kinds = Kinds(items.sizes.tolist())
-    kinds.handling = items.handling
+    kinds.handling, kinds.tipped_turns = items.handling, items.tipped_turns
     return kinds

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import flag, number, refuse_if, whole_number
+from pickplace.common.validate import flag, number, whole_number
 from pickplace.items.arrival import refill
 from pickplace.items.distributions import ItemDistribution, check_seed, search_items
 from pickplace.planners.base import MapPlanner, narrow_first
@@ -123,12 +123,11 @@ class MCTS(MapPlanner):
 
     def _search(self, state: State, mask: Tensor | None) -> Tensor:
         """Return the most visited choice of each problem, int64 ``[N]``; without a mask it is a flat action."""
+        at_once = MAX_NODES // self.simulations
+        if len(state.surface) > at_once:
+            parts = torch.arange(len(state.surface)).split(at_once)
+            return torch.cat([self._search(state.rows(part), None if mask is None else mask[part]) for part in parts])
         roots = self._nodes(state, mask)
-        refuse_if(
-            self.simulations * len(roots) > MAX_NODES,
-            f"planner.simulations={self.simulations}: for {len(roots)} problems at once the trees would have more than "
-            f"{MAX_NODES:,} nodes; expected fewer, or a smaller evaluation.batch_size.",
-        )
         each = max(1, self.wave // len(roots))
         for done in range(0, self.simulations, each):
             walks = [

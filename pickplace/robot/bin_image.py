@@ -47,7 +47,7 @@ def find_boxes(
     numbers, counts = np.unique(segments[segments > 0], return_counts=True)
     boxes, floor, free = [], seen.at(0.0), np.ones_like(seen.holes)
     for number in numbers[counts >= MIN_ITEM_PIXELS]:
-        box, seen_top = _read_box(seen, room, surface, segments, number, above, accuracy, labels is None)
+        box, seen_top = _read_box(seen, room, margin, surface, segments, number, above, accuracy, labels is None)
         boxes.append(box)
         if not isinstance(box, UnknownBox):
             free &= ~is_inside(floor, *seen_top)
@@ -88,14 +88,15 @@ def _segments(seen: Heights, above: np.ndarray, accuracy: float, labels: np.ndar
 
 
 def _read_box(
-    seen: Heights, room: Room, surface: np.ndarray, segments: np.ndarray, number: int, above: np.ndarray,
-    accuracy: float, narrowed: bool,
+    seen: Heights, room: Room, margin: float, surface: np.ndarray, segments: np.ndarray, number: int,
+    above: np.ndarray, accuracy: float, narrowed: bool,
 ) -> tuple[Box, tuple]:  # fmt: skip
     """Return the cuboid whose top fills a segment, and the seen part of its top: centre, sides and yaw.
 
     The cuboid is an :class:`UnknownBox` if it may go on where nothing is seen.
 
     Args:
+        margin: width of the border along the walls in which no top is seen, m.
         surface: see :meth:`Heights.surface`.
         narrowed: whether the filter of steps removed the outermost pixels of the segment; False if labels made it.
     """
@@ -116,15 +117,11 @@ def _read_box(
     axes = turned_axes(math.radians(yaw))
     free = np.concatenate([points[passed], seen.points[passed & (seen.height < height)]]) - (x, y)
     beyond, corners = ([each @ axis for axis in axes] for each in (free, room.corners - (x, y)))
-    gaps = [
-        min(
-            _least_beyond(beyond, (w, d), axis, sign, pixel),
-            (sign * corners[axis]).max() - (w, d)[axis] / 2 + pixel / 2,
-        )
-        for axis in (0, 1)
-        for sign in (-1, 1)
-    ]
-    outer = np.maximum(0.5 * pixel, np.array(gaps) - pixel)  # beyond the centres of the outermost pixels
+    sides = [(axis, sign) for axis in (0, 1) for sign in (-1, 1)]
+    free_gaps = np.array([_least_beyond(beyond, (w, d), axis, sign, pixel) for axis, sign in sides])
+    wall_gaps = np.array([(sign * corners[axis]).max() - (w, d)[axis] / 2 + pixel / 2 for axis, sign in sides])
+    outer = np.maximum(0.5 * pixel, np.minimum(free_gaps, wall_gaps) - pixel)  # beyond the outermost pixels' centres
+    longest = np.where(wall_gaps <= free_gaps, max(LONGEST_GAP * pixel, margin + pixel), LONGEST_GAP * pixel)
 
     def grown(by: np.ndarray) -> dict:
         shift = np.array([by[1] - by[0], by[3] - by[2]]) / 2 @ axes
@@ -133,7 +130,7 @@ def _read_box(
 
     error = float(max(0.0, outer.max() - pixel))
     on_top = is_inside(points, (x, y), (w, d), yaw)
-    if outer.max() <= LONGEST_GAP * pixel and not seen.holes_above(height, surface, room, accuracy, on_top).any():
+    if (outer <= longest).all() and not seen.holes_above(height, surface, room, accuracy, on_top).any():
         return Box(**grown(outer), edge_error=error).upright(), ((x, y), (w + 2 * pixel, d + 2 * pixel), yaw)
     return UnknownBox(**grown(outer)).upright(), ((x, y), (w, d), yaw)
 

@@ -205,7 +205,7 @@ class Camera:
 
     def _distances(self, depth) -> np.ndarray:
         """Check an image, and return it as float64, NaN where nothing is known."""
-        image = np.asarray(depth)
+        image = np.asarray(depth.filled(0) if isinstance(depth, np.ma.MaskedArray) else depth)
         refuse_if(
             image.ndim != 2 or image.dtype.kind not in "fiu",
             f"depth: got shape {list(image.shape)} of {image.dtype}, expected an image of distances, [rows, columns].",

@@ -205,7 +205,7 @@ class Planner:
         number = None if action is None else int(problem.taken_items(action))
         reasons = None
         if status != "ok":
-            self._refuse_unknown(scene, device)  # first: all reasons take a while
+            self._refuse_unknown(scene, device, exclude)  # first: all reasons take a while
             reasons, action = _reasons(problem, action), None
         known = 0 if problem.maps.bin_items == 1 else number
         motion = None if action is None else problem.motion(action)
@@ -234,11 +234,11 @@ class Planner:
             placed=placed,
         )
 
-    def _refuse_unknown(self, scene: Scene, device) -> None:
+    def _refuse_unknown(self, scene: Scene, device, exclude) -> None:
         """Refuse a scene that has no plan, if images with fewer unknown places might allow one."""
         may_have_plan = scene.has_holes
         if not may_have_plan and (likely := scene.without_gaps()) is not None:
-            problem = read_metric(self.cell, likely, device)
+            problem = read_metric(self.cell, likely, device, exclude)
             may_have_plan = bool(footprint_mask(problem.cell, problem.maps).any())
         refuse_if(
             may_have_plan,

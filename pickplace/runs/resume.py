@@ -36,7 +36,8 @@ LOCAL_VALUES = {
 
 #: Settings that a resumed run cannot change, and so all of ``env``: the state of its episodes depends on them.
 FIXED_KEYS = (
-    "seed", "items", "model.mask_infeasible", "collector.workers", "curriculum.levels", "warm_start.weights",
+    "seed", "items", "model.mask_infeasible", "collector.workers", "curriculum.levels", "curriculum.start_height",
+    "curriculum.end_height", "warm_start.weights",
 )  # fmt: skip
 
 #: Settings that a user may change without asking for more training.

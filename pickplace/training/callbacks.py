@@ -15,7 +15,13 @@ class Callback:
 
     ``trainer`` is the :class:`pickplace.training.trainer.Trainer`; ``trainer.end(reason)`` ends the training after the
     batch. ``metrics`` are those of the batch, by name; entries that a callback adds or changes are logged.
+
+    Attributes:
+        compares_validations: whether its state only compares validations. In a resumed run that validates on other
+            episodes, it then begins anew.
     """
+
+    compares_validations = False
 
     def on_batch(self, trainer: Any, metrics: dict[str, float]) -> None:
         """Called when a batch is learnt, before a validation that may follow."""
@@ -44,6 +50,8 @@ class EarlyStopping(Callback):
         occupancy: mean validation occupancy, 0 to 1, that ends it; None: any.
         patience: validations in a row without a new best that end it; None: any number.
     """
+
+    compares_validations = True
 
     def __init__(self, occupancy: float | None = None, patience: int | None = None):
         key = "callbacks.early_stopping."
@@ -79,12 +87,13 @@ class EarlyStopping(Callback):
         self.low = number("low", state["low"], 0, 1)
 
 
-def make_callbacks(cfg, states) -> dict[str, Callback]:
+def make_callbacks(cfg, states, validated_alike: bool = True) -> dict[str, Callback]:
     """Return the callbacks of a run by name, in the order of their config.
 
     Args:
         cfg: the config group ``callbacks``.
         states: their states by name, from a checkpoint; a callback without one begins anew.
+        validated_alike: whether validations are those of the run that saved the states.
 
     Raises:
         ValueError: naming the callback, for bad settings, a state that does not fit or one that cannot be saved.
@@ -98,7 +107,7 @@ def make_callbacks(cfg, states) -> dict[str, Callback]:
             "the settings of a callback, with its _target_",
         )
         try:
-            if name in states:
+            if name in states and (validated_alike or not callback.compares_validations):
                 callback.load_state_dict(states[name])
         except Exception as error:
             raise ValueError(f"callbacks.{name}: its state cannot be loaded ({sentence(error)}).") from error

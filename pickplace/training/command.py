@@ -42,6 +42,6 @@ def main() -> None:
 
 def check(cfg: DictConfig) -> None:
     """Refuse misspelt keys of levels, like those of other settings, before torch is imported."""
-    levels = OmegaConf.select(cfg, "curriculum.levels")
-    if cfg.curriculum._target_ == "curriculum" and OmegaConf.is_list(levels) and all(map(OmegaConf.is_dict, levels)):
+    kind, levels = (OmegaConf.select(cfg, f"curriculum.{key}") for key in ("_target_", "levels"))
+    if kind == "curriculum" and OmegaConf.is_list(levels) and all(map(OmegaConf.is_dict, levels)):
         check_keys(levels)

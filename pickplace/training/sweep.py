@@ -40,6 +40,7 @@ class SweepRun:
     status: str = "stopped"  # or finished, running, failed, unreadable
     frames: int = 0  # environment steps trained
     validations: list[dict[str, float]] = field(default_factory=list)  # rows of metrics.csv with a validation
+    seed: str = "0"
     ended: str = ""  # why a callback ended a finished run before its budget was spent
     error: str = ""  # of a failed or unreadable run, in one sentence
 
@@ -75,13 +76,16 @@ def read_run(folder: Path) -> SweepRun:
             rows = [{"frames": facts["frames"], **latest}] if facts else []
         run.frames = int(rows[-1]["frames"]) if rows else 0
         run.validations = [row for row in rows if "eval/occupancy" in row]
+        # The checkpoint's config first: a resumed run may have a larger budget.
+        config = facts.get("config") or read_note(folder, "config.yaml")
+        config = config if isinstance(config, dict) else {}
+        run.seed = run.overrides.get("seed", str(config.get("seed", 0)))
         if (folder / FAILURE).is_file():
             run.status, run.error = "failed", read_text(folder / FAILURE).strip()
         elif is_claimed(folder):
             run.status = "running"
-        else:  # the checkpoint's config first: a resumed run may have a larger budget
-            config = facts.get("config") or read_note(folder, "config.yaml")
-            budget = config.get("total_frames") if isinstance(config, dict) else None
+        else:
+            budget = config.get("total_frames")
             run.ended = str(facts.get("ended") or "")
             if run.ended or (isinstance(budget, int) and run.frames >= budget):
                 run.status = "finished"
@@ -95,7 +99,7 @@ class Setting:
 
     Attributes:
         overrides: without the seed.
-        finished: the runs that finished, with a validation.
+        finished: the runs that finished, with a validation, one for each seed.
         mean: their mean final validation occupancy; None without any.
         interquartile_mean: the mean of their middle half; None with fewer than four, for which it would be the mean.
         interval: the 95% interval of their mean, see :func:`bootstrap95`; two times None with fewer than two.
@@ -107,7 +111,8 @@ class Setting:
 
         self.runs = runs
         self.overrides = {key: value for key, value in runs[0].overrides.items() if key != "seed"}
-        self.finished = [run for run in runs if run.status == "finished" and run.last]
+        # A seed that was trained twice, such as by name and by default, counts once.
+        self.finished = [*{run.seed: run for run in runs if run.status == "finished" and run.last}.values()]
         finals, count = np.array([run.last["eval/occupancy"] for run in self.finished]), len(self.finished)
         self.mean = float(finals.mean()) if count else None
         self.interquartile_mean = float(trim_mean(finals, 0.25)) if count >= 4 else None

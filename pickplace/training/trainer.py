@@ -87,7 +87,8 @@ class Trainer:
         self.episodes: Episodes | None = None
         # With other settings, a training that a callback had ended goes on.
         self.ended = facts.get("ended", "") if self.resumed and is_trained_alike(facts, self.saved_config) else ""
-        self.callbacks = callbacks.make_callbacks(cfg.get("callbacks") or {}, facts.get("callbacks") or {})
+        alike = is_validated_alike(facts, self.saved_config) if self.resumed else True
+        self.callbacks = callbacks.make_callbacks(cfg.get("callbacks") or {}, facts.get("callbacks") or {}, alike)
         # The order of these fixes the random draws of a seed.
         self._make_environments()
         self._make_networks()
@@ -205,7 +206,8 @@ class Trainer:
             reason: a sentence for the log, the report and the learning curve.
         """
         log.info("%s frames: %s", f"{self.frames:,}", reason)
-        self.ended = reason or "by a callback"
+        if self.frames < self.cfg.total_frames:
+            self.ended = reason or "by a callback"
 
     @contextmanager
     def running(self) -> Iterator[StopRequest]:
@@ -341,7 +343,9 @@ class Trainer:
         Args:
             stopped: whether a signal has ended the loop.
         """
-        run_dir, level, end = self.run_dir, self.curriculum.level, self.curriculum.end
+        run_dir, end, table = self.run_dir, self.curriculum.end, self.run_dir / "metrics.csv"
+        rows = read_csv(table) if table.is_file() else []
+        level = max([self.curriculum.level, *(int(row["curriculum/level"]) for row in rows)])  # levels may also fall
         if stopped:
             command = f"pickplace-train resume={shlex.quote(str(run_dir))}{self.resume_overrides}"
             results.info("stopped at %s frames; continue with: %s", f"{self.frames:,}", command)
@@ -353,12 +357,12 @@ class Trainer:
                 level,
                 end,
             )
-        if not (run_dir / "metrics.csv").is_file():
+        if not rows:
             return
         levels = self.curriculum.what, end
-        learning_curve(run_dir / "metrics.csv", run_dir / "learning_curve.png", levels, self.ended)
+        learning_curve(table, run_dir / "learning_curve.png", levels, self.ended)
         # Without a validation, such as after logger=none, there is nothing to report.
-        is_validated = self.best >= 0 and any("eval/occupancy" in row for row in read_csv(run_dir / "metrics.csv"))
+        is_validated = self.best >= 0 and any("eval/occupancy" in row for row in rows)
         # If this process has no episodes, nothing was trained since the report was written.
         if self.is_complete and is_validated and (self.episodes is not None or not (run_dir / folder.REPORT).is_file()):
             log.info("writing the report")

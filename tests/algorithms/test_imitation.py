@@ -20,6 +20,7 @@ from pickplace.policies.fcn4d.policy import Fcn4d
 from pickplace.policies.fcn_grasp.policy import fcn_grasp
 from pickplace.policies.individual.policy import IndividualRl, individual_grasp
 from pickplace.rules.step import apply
+from pickplace.runs import checkpoint
 from pickplace.runs.provenance import first_steps
 from pickplace.training.settings import check_settings
 
@@ -77,6 +78,19 @@ def test_of_several_items_the_taught_one_is_learnt(name):
     ours, theirs = (apply(env.cell, env.state, action) for action in (own, JointDBL(env.cell).decide(td)))
     assert torch.equal(ours.taken, theirs.taken) and torch.equal(ours.footprint, theirs.footprint)
     assert ours.taken.unique().numel() == 3
+
+
+def test_a_teacher_s_network_is_where_the_training_is(states, monkeypatch):
+    """Wherever its own training was."""
+    read = checkpoint.read
+
+    def read_from_a_gpu(place):
+        state, facts = read(place)
+        return state, {**facts, "config": {**facts["config"], "device": "cuda:7"}}
+
+    monkeypatch.setattr(checkpoint, "read", read_from_a_gpu)
+    trained, _ = warm_start(config("policy", checkpoint="pretrained/r4", candidates="all"), "grasp", states[0])
+    assert (trained.ask(states[1], 0) >= 0).all()
 
 
 def test_teachers_that_fail_draw_or_are_trained(states):
@@ -159,6 +173,11 @@ def test_phases_follow_each_other():
         (
             config("policy", checkpoint="nowhere", candidates="all"),
             r"warm_start.checkpoint='.*nowhere': no checkpoint there",
+        ),
+        (config(checkpoint="pretrained/r4"), "warm_start.checkpoint='pretrained/r4': expected null, or a teacher that"),
+        (
+            config("policy", frames=0, checkpoint="pretrained/r4", candidates="all"),
+            "warm_start.checkpoint='pretrained/r4': expected null, or a teacher that follows a policy",
         ),
     ],
 )

@@ -78,10 +78,11 @@ def test_at_a_high_temperature_rare_choices_are_candidates():
     assert shares[0] < 0.02 and shares[1] == pytest.approx(2 / 5, abs=0.02)
 
 
+@pytest.mark.parametrize("temperature", [0.01, 1.0])
 @pytest.mark.parametrize("samples", [3, 4, 7])
-def test_forbidden_choices_are_no_candidates(samples):
+def test_forbidden_choices_are_no_candidates(samples, temperature):
     logits = torch.tensor([[0.0, MASKED, 1.0, MASKED, MASKED], [MASKED, MASKED, MASKED, 0.3, MASKED]])
-    candidates, log_prob, log_weight = draw_candidates(logits, samples, 1.0)
+    candidates, log_prob, log_weight = draw_candidates(logits, samples, temperature)
     assert candidates[0].sort().values.unique().tolist() == [0, 2] and (candidates[1] == 3).all()
     torch.testing.assert_close(log_weight.exp().sum(1), torch.ones(2))
     torch.testing.assert_close(log_weight[0, :2].exp(), logits[0].softmax(0)[candidates[0, :2]])

@@ -7,7 +7,7 @@ from commands import composed
 from pickplace import PickPlaceEnv, Planner
 from pickplace.envs.saved_state import check_saved_states
 from pickplace.evaluation.evaluate import run
-from pickplace.items.distributions import Kinds
+from pickplace.items.distributions import Kinds, search_items
 from pickplace.items.orders import Orders
 from pickplace.planners.heuristics import JointDBL, RandomFeasible
 from pickplace.rules.gripper.rules import Overlap
@@ -141,3 +141,4 @@ def test_orders_say_on_which_sides_an_item_may_lie(tmp_path):
         turns.append(env.state.items.turns[0].tolist())
         data = env.step(data.set("action", data["action_mask"].int().argmax(1)))["next"]
     assert turns == [[0b1111] * 3, [0b1111, 0, 0], [0b0101, 0b1010, 0]] and data["truncated"]
+    assert torch.equal(search_items(orders).tipped_turns, orders.tipped_turns)  # a search imagines no other

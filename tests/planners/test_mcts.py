@@ -6,6 +6,7 @@ from problems import occupancies
 
 from pickplace import PickPlaceEnv
 from pickplace.items.distributions import Kinds, Recorded
+from pickplace.planners import mcts
 from pickplace.planners.mcts import MCTS, _Edge, _Node
 from pickplace.rules.gripper.rules import Overlap
 from pickplace.rules.item import Item
@@ -134,6 +135,16 @@ def test_a_recorded_stream_is_not_looked_up_and_a_full_tote_has_nothing_to_searc
     for depth in (1.0, 0.0):
         observation["tote_depth"] = torch.full_like(observation["tote_depth"], depth)
         assert search.decide(observation).item() in range(env.cell.num_actions)
+
+
+@pytest.mark.parametrize("mask", [True, False])
+def test_many_problems_are_searched_in_groups(mask, monkeypatch):
+    monkeypatch.setattr(mcts, "MAX_NODES", 16)
+    env, sizes = make_env(7), []
+    search = search_of(env, 8, mask=mask)
+    make = search._nodes
+    search._nodes = lambda state, *rest: sizes.append(len(state.surface)) or make(state, *rest)
+    assert len(search.decide(env.reset())) == 7 and max(sizes) <= 16 and sizes.count(2) >= 3
 
 
 @pytest.mark.parametrize(

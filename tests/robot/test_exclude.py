@@ -1,5 +1,6 @@
 """Picks that failed are not planned again, on the grid and in metres."""
 
+from dataclasses import replace
 from itertools import count
 from math import dist
 
@@ -16,6 +17,7 @@ REACH = Annulus(radii=(1, 90), heights=(-9, 90), bin=(-20, 0, 0), tote=(8, 0, 0)
 SCENES = {
     "grid": (Scene.from_maps(ITEM, np.full((6, 6), 5)), 1.0),
     "metres": (Scene(BOXES[:1], np.full((30, 30), 0.25), 0.05), 0.05),
+    "gaps": (Scene([replace(BOXES[0], edge_error=0.001)], np.full((30, 30), 0.25), 0.05), 0.05),
     "several": (Scene(BOXES, np.full((30, 30), 0.25), 0.05), 0.05),
 }
 

@@ -207,6 +207,28 @@ def test_a_hole_in_the_tote_reaches_up_to_the_rim(side, centre):
     assert found.has_holes and not tote_map(*see("tote", replace(dark, dark=False))).has_holes
 
 
+def test_a_masked_pixel_is_unknown():
+    eye, image = see("tote")
+    mask = np.zeros(image.shape, bool)
+    mask[100:140, 140:180] = True
+    hidden, masked = (tote_map(eye, each) for each in (np.where(mask, 0, image), np.ma.masked_array(image, mask)))
+    assert masked.has_holes and (masked.highest == hidden.highest).all()
+
+
+@pytest.mark.parametrize("pixel", [0.001, 0.0013])
+@pytest.mark.parametrize("gap", [0.0, 0.002])
+def test_an_item_at_a_wall_is_measured_by_fine_pixels(pixel, gap, monkeypatch):
+    """Though the border along the wall, in which no top is seen, is several pixels wide."""
+    monkeypatch.setattr(camera_truth, "SHAPE", (400, 480))
+    truth = Truth((0.3, 0.3, 0.1), ROOMS["tote"], in_bin=[Thing((gap + 0.05, 0.15), (0.1, 0.08), 0.0, 0.06)])
+    eye = Camera.looking_down((0.15, 0.15), 1.2, 1.2 / pixel, camera_truth.SHAPE)
+    depth, dark = camera_truth.cast(eye.rays(), eye.pose[:3, 3], truth, "bin")
+    noise = np.random.default_rng(0).normal(0, 0.001, depth.shape)
+    (box,) = eye.items(np.where(dark, np.nan, depth + noise), CELL, SIZE, bin_height=0.1)
+    assert type(box) is Box and box.x - box.w / 2 < gap + 0.001 and box.x + box.w / 2 > gap + 0.099
+    assert box.w - box.edge_error < 0.101 and box.edge_error < 0.005
+
+
 def test_a_hole_in_a_top_supports_nothing():
     lower, dark = Thing((0.15, 0.15), (0.1, 0.1), 0.0, 0.08), Thing((0.15, 0.15), (0.03, 0.03), 0.0, 0.081, dark=True)
     found = tote_map(*see("tote", lower, dark))

@@ -414,6 +414,10 @@ def test_a_resumed_run_keeps_its_levels():
     facts = {"config": saved_form(composed("experiment=quick", "curriculum.levels=[{tote_height: 2},{}]")), **SAVED}
     with pytest.raises(ValueError, match=r"curriculum.levels=\[\{\}\]: the run began with .* expected a new run"):
         resumed_config("run", facts, ["curriculum.levels=[{}]"])
+    with pytest.raises(ValueError, match="curriculum.end_height=3: the run began with .* expected a new run"):
+        resumed_config(
+            "run", {"config": saved_form(composed("experiment=quick")), **SAVED}, ["curriculum.end_height=3"]
+        )
 
 
 def test_only_the_user_says_what_to_trust():

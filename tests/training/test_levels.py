@@ -107,6 +107,15 @@ def test_a_bad_level_is_named(levels, message):
     assert "\n" not in str(error.value)
 
 
+def test_items_of_one_s_own_without_mixes_are_refused():
+    class Own(Kinds):
+        def sample(self, stream, seed, episode, step, bin_size):
+            return super().sample(stream, seed, episode, step, bin_size)
+
+    with pytest.raises(ValueError, match=r"items='Own': expected a class with sample\(stream, ..., bin_size, mix=None"):
+        Own([(1, 1, 1), (2, 1, 1)]).mixed([{"width": [1, 1]}])
+
+
 def test_a_level_at_which_no_episode_could_begin_is_named(tmp_path):
     tall = Uniform(height=(1, 3))
     with pytest.raises(ValueError, match=r"levels\[1\].tote_height=2: expected at least 3, the height of its tallest"):

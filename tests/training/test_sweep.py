@@ -91,6 +91,14 @@ def test_settings_are_compared_over_their_seeds(tmp_path, caplog):
     assert "seed" not in rows[0] and len(table(tmp_path)) == 10
 
 
+def test_a_seed_that_was_trained_twice_counts_once(tmp_path):
+    """By default, and by name."""
+    for name, words in {"a": [], "b": ["seed=0"], "c": ["seed=1"]}.items():
+        make_run(tmp_path, name, ["algo.lr=1", *words], [0.8 if name < "c" else 0.6], total=100)
+    (setting,) = summarize(tmp_path)
+    assert (len(setting.runs), len(setting.finished)) == (3, 2) and setting.mean == pytest.approx(0.7)
+
+
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [

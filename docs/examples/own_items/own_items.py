@@ -19,10 +19,10 @@ class Batches(Kinds):
             raise ValueError(f"items.run={run!r}: expected a whole number >= 1.")
         self.run = run
 
-    def sample(self, stream, seed, episode, step, bin_size):
+    def sample(self, stream, seed, episode, step, bin_size, mix=None):
         """Return the ``step``-th item of each episode, int64 ``[N]``; a function of its arguments alone."""
         (kind,) = hashed_uniform(stream, seed, episode, step // self.run, 1)
-        w, d, h = self.sizes.to(step.device)[self._index(kind, step)].unbind(-1)
+        w, d, h = self.sizes.to(step.device)[self._index(kind, step, mix)].unbind(-1)
         _, across, along = hashed_uniform(stream, seed, episode, step, 3)
         x = (across * (bin_size[0] - w + 1)).long()
         y = (along * (bin_size[1] - d + 1)).long()
