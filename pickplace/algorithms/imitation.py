@@ -59,7 +59,7 @@ class WarmStart:
         self.policy, self.cell, self.seed = policy, env.cell, seed
         made_by = None if cfg.teacher is None else find("warm_start.teacher", cfg.teacher._target_)
         is_used = cfg.frames > 0 and "policy" in getattr(made_by, "needs", ())
-        wanted = "null, or a teacher that follows a policy; the policy itself begins with warm_start.weights"
+        wanted = "null, or warm_start.frames above 0 and a teacher that follows a policy"
         expect(is_used or cfg.checkpoint is None, "warm_start.checkpoint", cfg.checkpoint, wanted)
         if trained >= cfg.frames:
             return

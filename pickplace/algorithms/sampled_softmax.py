@@ -83,7 +83,9 @@ def draw_candidates(logits: Tensor, samples: int, temperature: float) -> tuple[T
     samples = min(samples, logits.shape[1] - 1)
     every = logits.log_softmax(1)
     taken = _add_noise(every).argmax(1, keepdim=True)
-    others = (every / temperature).clamp(min=MASKED).scatter(1, taken, -torch.inf)  # a small one would overflow
+    others = (
+        (every / temperature).clamp(min=MASKED).scatter(1, taken, -torch.inf)
+    )  # a low temperature makes MASKED infinite
     scale = others.logsumexp(1, keepdim=True)
     score, order = _add_noise(others - scale).topk(1 + samples)  # the taken one cannot be drawn again
     candidates = torch.cat([taken, order[:, :-1]], 1)

@@ -26,7 +26,7 @@ from pickplace.rules.pile import Pile
 from pickplace.rules.state import State
 from pickplace.rules.step import apply, put_down
 
-MAX_NODES = 1_000_000  # of all trees of a decision
+MAX_NODES = 1_000_000  # of the trees that are searched at once; more problems are searched in groups
 
 
 #: Surface, table of the items in the bin, pile, and table of the items that are seen to come, of one problem.
@@ -81,7 +81,7 @@ class MCTS(MapPlanner):
             as in the paper, in the tree and in the rollouts.
         exploration: weight of UCB1's second term; returns are shares of the tote's volume.
         widening: exponent of the number of bins sampled after an action.
-        wave: number of simulations that advance together, over all problems.
+        wave: number of simulations that advance together, over all problems that are searched at once.
         seed: of the search.
     """
 

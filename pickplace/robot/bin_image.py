@@ -15,7 +15,7 @@ from pickplace.robot.room_check import fit_plane
 
 MOST_MISSING = 0.01  # greatest share of the inside of its rectangle that an item's top may leave free
 BORDER = 2.5  # width of the rectangle's border, pixels; the rest is its inside
-LONGEST_GAP = 3.5  # longest gap beyond the seen edge of an item, pixels; behind a longer one it may go on unseen
+LONGEST_GAP = 3.5  # longest gap beyond the seen edge of an item, pixels; a wall that hides more allows more
 HIDDEN_PIXELS = 1.5  # distance from a box at which its edge should be seen, pixels
 EDGE_POINTS = 32  # number of points along each side of a box, and along each ray
 MIN_ITEM_PIXELS = 9  # fewest pixels of a thing in a bin; smaller ones are ignored
@@ -120,6 +120,7 @@ def _read_box(
     sides = [(axis, sign) for axis in (0, 1) for sign in (-1, 1)]
     free_gaps = np.array([_least_beyond(beyond, (w, d), axis, sign, pixel) for axis, sign in sides])
     wall_gaps = np.array([(sign * corners[axis]).max() - (w, d)[axis] / 2 + pixel / 2 for axis, sign in sides])
+    free_gaps[wall_gaps <= margin + 2 * pixel] = np.inf  # the border hides where the item ends
     outer = np.maximum(0.5 * pixel, np.minimum(free_gaps, wall_gaps) - pixel)  # beyond the outermost pixels' centres
     longest = np.where(wall_gaps <= free_gaps, max(LONGEST_GAP * pixel, margin + pixel), LONGEST_GAP * pixel)
 

@@ -17,8 +17,8 @@ class Callback:
     batch. ``metrics`` are those of the batch, by name; entries that a callback adds or changes are logged.
 
     Attributes:
-        compares_validations: whether its state only compares validations. In a resumed run that validates on other
-            episodes, it then begins anew.
+        compares_validations: whether its state only compares validations. In a resumed run that validates by
+            other settings (``evaluation``, ``planner``), it then begins anew.
     """
 
     compares_validations = False

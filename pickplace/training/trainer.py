@@ -203,7 +203,7 @@ class Trainer:
         """End the training after this batch, for a callback; it is validated, saved and reported as a complete one.
 
         Args:
-            reason: a sentence for the log, the report and the learning curve.
+            reason: a sentence for the log; if the budget is not spent, also for the report and the learning curve.
         """
         log.info("%s frames: %s", f"{self.frames:,}", reason)
         if self.frames < self.cfg.total_frames:

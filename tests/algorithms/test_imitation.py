@@ -174,10 +174,13 @@ def test_phases_follow_each_other():
             config("policy", checkpoint="nowhere", candidates="all"),
             r"warm_start.checkpoint='.*nowhere': no checkpoint there",
         ),
-        (config(checkpoint="pretrained/r4"), "warm_start.checkpoint='pretrained/r4': expected null, or a teacher that"),
+        (
+            config(checkpoint="pretrained/r4"),
+            "warm_start.checkpoint='pretrained/r4': expected null, or warm_start.frames above 0 and",
+        ),
         (
             config("policy", frames=0, checkpoint="pretrained/r4", candidates="all"),
-            "warm_start.checkpoint='pretrained/r4': expected null, or a teacher that follows a policy",
+            "warm_start.checkpoint='pretrained/r4': expected null, or warm_start.frames above 0 and",
         ),
     ],
 )

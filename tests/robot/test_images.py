@@ -18,6 +18,7 @@ from camera_truth import FOCAL, SHAPE, Thing, Truth  # noqa: E402
 from pickplace import Box, Camera, CellSpec, DepthMapError, Planner, Scene  # noqa: E402
 from pickplace.robot.box import HiddenBox, UnknownBox  # noqa: E402
 from pickplace.robot.depth_image import HOLE, holes_in, median_of_nine  # noqa: E402
+from pickplace.robot.measure import turned_axes  # noqa: E402
 
 CELL, SIZE = CellSpec(bin_size=(6, 6, 1), tote_size=(6, 6, 5)), 0.05
 ROOMS = {"bin": (0.3, 0.3, 0.05), "tote": (0.3, 0.3, 0.25)}
@@ -216,17 +217,21 @@ def test_a_masked_pixel_is_unknown():
 
 
 @pytest.mark.parametrize("pixel", [0.001, 0.0013])
-@pytest.mark.parametrize("gap", [0.0, 0.002])
-def test_an_item_at_a_wall_is_measured_by_fine_pixels(pixel, gap, monkeypatch):
+@pytest.mark.parametrize("gap", [0.0003, 0.002])
+@pytest.mark.parametrize("yaw", [0, 2])
+def test_an_item_at_a_wall_is_measured_by_fine_pixels(pixel, gap, yaw, monkeypatch):
     """Though the border along the wall, in which no top is seen, is several pixels wide."""
     monkeypatch.setattr(camera_truth, "SHAPE", (400, 480))
-    truth = Truth((0.3, 0.3, 0.1), ROOMS["tote"], in_bin=[Thing((gap + 0.05, 0.15), (0.1, 0.08), 0.0, 0.06)])
+    thing = Thing((0.0, 0.15), (0.1, 0.08), 0.0, 0.06, np.radians(yaw))
+    thing = replace(thing, centre=(gap - thing.polygon(thing.sides)[:, 0].min(), 0.15))
+    truth = Truth((0.3, 0.3, 0.1), ROOMS["tote"], in_bin=[thing])
     eye = Camera.looking_down((0.15, 0.15), 1.2, 1.2 / pixel, camera_truth.SHAPE)
     depth, dark = camera_truth.cast(eye.rays(), eye.pose[:3, 3], truth, "bin")
     noise = np.random.default_rng(0).normal(0, 0.001, depth.shape)
     (box,) = eye.items(np.where(dark, np.nan, depth + noise), CELL, SIZE, bin_height=0.1)
-    assert type(box) is Box and box.x - box.w / 2 < gap + 0.001 and box.x + box.w / 2 > gap + 0.099
-    assert box.w - box.edge_error < 0.101 and box.edge_error < 0.005
+    corners = (thing.polygon(thing.sides) - (box.x, box.y)) @ turned_axes(np.radians(box.yaw)).T
+    assert type(box) is Box and (np.abs(corners) < np.add((box.w, box.d), 2 * pixel) / 2).all()
+    assert box.w - box.edge_error < 0.102 and box.edge_error < 0.005
 
 
 def test_a_hole_in_a_top_supports_nothing():
