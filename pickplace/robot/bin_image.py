@@ -120,7 +120,7 @@ def _read_box(
     sides = [(axis, sign) for axis in (0, 1) for sign in (-1, 1)]
     free_gaps = np.array([_least_beyond(beyond, (w, d), axis, sign, pixel) for axis, sign in sides])
     wall_gaps = np.array([(sign * corners[axis]).max() - (w, d)[axis] / 2 + pixel / 2 for axis, sign in sides])
-    free_gaps[wall_gaps <= margin + 2 * pixel] = np.inf  # the border hides where the item ends
+    free_gaps[wall_gaps <= margin + 1.5 * pixel] = np.inf  # the border hides where the item ends
     outer = np.maximum(0.5 * pixel, np.minimum(free_gaps, wall_gaps) - pixel)  # beyond the outermost pixels' centres
     longest = np.where(wall_gaps <= free_gaps, max(LONGEST_GAP * pixel, margin + pixel), LONGEST_GAP * pixel)
 
