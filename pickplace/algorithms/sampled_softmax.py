@@ -83,9 +83,8 @@ def draw_candidates(logits: Tensor, samples: int, temperature: float) -> tuple[T
     samples = min(samples, logits.shape[1] - 1)
     every = logits.log_softmax(1)
     taken = _add_noise(every).argmax(1, keepdim=True)
-    others = (
-        (every / temperature).clamp(min=MASKED).scatter(1, taken, -torch.inf)
-    )  # a low temperature makes MASKED infinite
+    finite = (every / temperature).clamp(min=MASKED)  # at a low temperature MASKED would become infinite
+    others = finite.scatter(1, taken, -torch.inf)
     scale = others.logsumexp(1, keepdim=True)
     score, order = _add_noise(others - scale).topk(1 + samples)  # the taken one cannot be drawn again
     candidates = torch.cat([taken, order[:, :-1]], 1)

@@ -93,7 +93,7 @@ def make_callbacks(cfg, states, validated_alike: bool = True) -> dict[str, Callb
     Args:
         cfg: the config group ``callbacks``.
         states: their states by name, from a checkpoint; a callback without one begins anew.
-        validated_alike: whether validations are those of the run that saved the states.
+        validated_alike: whether this run validates by the same settings as the run that saved the states.
 
     Raises:
         ValueError: naming the callback, for bad settings, a state that does not fit or one that cannot be saved.

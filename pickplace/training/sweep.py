@@ -40,7 +40,7 @@ class SweepRun:
     status: str = "stopped"  # or finished, running, failed, unreadable
     frames: int = 0  # environment steps trained
     validations: list[dict[str, float]] = field(default_factory=list)  # rows of metrics.csv with a validation
-    seed: str = "0"
+    seed: str = "0"  # as on the command line
     ended: str = ""  # why a callback ended a finished run before its budget was spent
     error: str = ""  # of a failed or unreadable run, in one sentence
 
