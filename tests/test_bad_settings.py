@@ -22,7 +22,6 @@ from pickplace.config.composition import apply_overrides
 from pickplace.config.registry import build
 from pickplace.evaluation.evaluate import prepare
 from pickplace.items.distributions import Kinds, Uniform
-from pickplace.planners.mcts import MCTS
 from pickplace.policies.fcn_grasp import network as footprint_fcn
 from pickplace.policies.fcn_grasp.policy import FcnGrasp
 from pickplace.rules.masks import placing_maps
@@ -380,8 +379,6 @@ def test_another_number_of_workers_is_refused(smoke_run, tmp_path):
 def test_a_search_that_would_fill_the_memory_is_refused():
     cell, items = CellSpec(), Uniform((1, 2), (1, 2), (1, 1))
     state = PickPlaceEnv(num_envs=300).reset()
-    with pytest.raises(ValueError, match="planner.simulations=5000: for 300 problems .* evaluation.batch_size"):
-        MCTS(cell, items).decide(state)
     planner = build(
         "planner",
         {"_target_": "lookahead", "samples": 10_000},
