@@ -57,7 +57,7 @@ class PickPlaceEnv(EnvBase):
         * further terms, see ``observation``.
         * ``action_mask``, bool ``[N, N_a]``: True exactly where the action would succeed.
         * ``footprint_mask``, bool ``[N, M * Q * W_T * D_T]``, only if ``masks`` names it: the distinct
-          ``(item, parity, x, y)`` that some action reaches; ``corner_mask`` likewise: those of them in corners.
+          ``(item, quarter_turned, x, y)`` that some action reaches; ``corner_mask`` likewise: those of them in corners.
         * ``occupancy``, float32 ``[N, 1]``: volume placed / volume of the tote.
 
     Rewards:
@@ -306,7 +306,7 @@ class PickPlaceEnv(EnvBase):
     def state(self) -> State:
         """The state of all problems."""
         items, coming = Item.from_table(self.item), Item.from_table(self.coming) if self.cell.preview else None
-        return State(self.surface, self.tote_height, items, self._differs, self._pile, coming)
+        return State(self.surface, self.tote_height, items, self._episode_settings, self._pile, coming)
 
     def _empty_pile(self, batch: int) -> Pile | None:
         return Pile.empty(batch, self.cell.tote_size, self.cell.pile_room, self.device) if self.cell.handling else None
@@ -316,7 +316,7 @@ class PickPlaceEnv(EnvBase):
         return Pile(*map(self.get_buffer, Pile._fields)) if self.cell.handling else None
 
     @property
-    def _differs(self) -> Episode:
+    def _episode_settings(self) -> Episode:
         return Episode(**{SETTINGS[key].field: self.get_buffer(SETTINGS[key].field) for key in self.cell.varies})
 
     @property
@@ -326,8 +326,8 @@ class PickPlaceEnv(EnvBase):
 
     def _refill(self, rows: Tensor, left: Item) -> Item:
         """Let items arrive in the bins in ``rows``, bool ``[N]``; ``left`` and the result are all items, ``[N, M]``."""
-        rows = rows & may_arrive(self.cell, left, self._differs)
-        items, arrived = refill(self.cell, self.items, self.stream, *self._address, left, rows, self._differs)
+        rows = rows & may_arrive(self.cell, left, self._episode_settings)
+        items, arrived = refill(self.cell, self.items, self.stream, *self._address, left, rows, self._episode_settings)
         self.item.copy_(items.table)
         self.arrived.copy_(arrived)
         self._look_ahead()
@@ -336,7 +336,8 @@ class PickPlaceEnv(EnvBase):
     def _look_ahead(self) -> None:
         """Update the items of the preview."""
         if self.cell.preview:
-            self.coming.copy_(coming_items(self.cell, self.items, self.stream, *self._address, self._differs).table)
+            coming = coming_items(self.cell, self.items, self.stream, *self._address, self._episode_settings)
+            self.coming.copy_(coming.table)
 
     @property
     def _address(self) -> tuple[Tensor, Tensor, Tensor]:

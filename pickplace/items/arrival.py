@@ -14,7 +14,7 @@ from pickplace.rules.state import FULL_TASK, Episode
 
 def refill(
     cell: CellSpec, source: ItemDistribution, stream: str, seed: Tensor, episode: Tensor, arrived: Tensor, items: Item,
-    rows: Tensor, differs: Episode = FULL_TASK,
+    rows: Tensor, settings: Episode = FULL_TASK,
 ) -> tuple[Item, Tensor]:  # fmt: skip
     """Return the bins after new items arrived, ``[N, M]``, and the number that has arrived in all, int64 ``[N]``.
 
@@ -29,14 +29,14 @@ def refill(
         arrived: int64 ``[N]``, number of items that have arrived so far.
         items: ``[N, M]``, the first ones filled.
         rows: bool ``[N]``, the bins in which items may arrive, see :func:`~pickplace.rules.bin.may_arrive`.
-        differs: settings in which the episodes differ.
+        settings: those in which the episodes differ.
     """
     open_ = rows
     for number in range(0, items.x.shape[1], cell.poses):
-        open_ = open_ & is_below_limit(items, differs)
+        open_ = open_ & is_below_limit(items, settings)
         if number and not any_of(open_):
             break
-        item, before = next_item(cell, source, stream, seed, episode, arrived, differs), items
+        item, before = next_item(cell, source, stream, seed, episode, arrived, settings), items
         for pose in range(cell.poses):
             posed = in_pose(cell, source, item, pose)
             if must_share(items, open_):
@@ -54,16 +54,16 @@ def refill(
 
 def next_item(
     cell: CellSpec, source: ItemDistribution, stream: str, seed: Tensor, episode: Tensor, arrived: Tensor,
-    differs: Episode,
+    settings: Episode,
 ) -> Item:  # fmt: skip
     """Return the item that arrives next in each episode, ``[N]``, at its own place; arguments: see :func:`refill`."""
-    item = source.sample(stream, seed, episode, arrived, cell.bin_size, **source.of_mix(differs.item_mix))
-    return item if differs.turns is None else item._replace(turns=item.turns & differs.turns)
+    item = source.sample(stream, seed, episode, arrived, cell.bin_size, **source.mix_arguments(settings.item_mix))
+    return item if settings.turns is None else item._replace(turns=item.turns & settings.turns)
 
 
 def coming_items(
     cell: CellSpec, source: ItemDistribution, stream: str, seed: Tensor, episode: Tensor, arrived: Tensor,
-    differs: Episode = FULL_TASK,
+    settings: Episode = FULL_TASK,
 ) -> Item:  # fmt: skip
     """Return the items of the preview, in their order, ``[N, p]``; arguments: see :func:`refill`.
 
@@ -72,6 +72,6 @@ def coming_items(
     count, number = len(arrived), torch.arange(cell.preview, device=arrived.device)
     row = torch.arange(count, device=arrived.device).repeat_interleave(cell.preview)
     later = (arrived[:, None] + number).flatten()
-    item = next_item(cell, source, stream, seed[row], episode[row], later, differs.rows(row))
-    seen = item.exists if differs.preview is None else item.exists & (number.repeat(count) < differs.preview[row])
+    item = next_item(cell, source, stream, seed[row], episode[row], later, settings.rows(row))
+    seen = item.exists if settings.preview is None else item.exists & (number.repeat(count) < settings.preview[row])
     return Item.from_table((item.table * seen[:, None]).unflatten(0, (count, cell.preview)))

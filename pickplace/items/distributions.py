@@ -154,7 +154,7 @@ class ItemDistribution:
         """Return the number of items that arrive in each episode, int64 ``[N]``; 0: the episodes do not end."""
         return torch.zeros_like(episode)
 
-    def of_mix(self, mix: Tensor | None) -> dict[str, Tensor]:
+    def mix_arguments(self, mix: Tensor | None) -> dict[str, Tensor]:
         """Return the argument ``mix`` of :meth:`sample` and :meth:`spread`; an empty dict without mixes."""
         return {} if mix is None or self.mixes == 1 else {"mix": mix}
 
@@ -179,7 +179,7 @@ class ItemDistribution:
 
     def spread(self, seed: Tensor, rank: Tensor, count: int, bin_size, mix: Tensor | None = None) -> Item:
         """Return the ``rank``-th of ``count`` items for each seed, int64 ``[N]``; here they are independent."""
-        return self.sample("train", seed, rank, torch.zeros_like(rank), bin_size, **self.of_mix(mix))
+        return self.sample("train", seed, rank, torch.zeros_like(rank), bin_size, **self.mix_arguments(mix))
 
     def corners(self, kind: int, bin_size) -> list[tuple[int, int]]:
         """Return every bin position ``(x, y)`` at which kind number ``kind`` may arrive."""

@@ -74,7 +74,7 @@ class Published(ItemDistribution):
 
     def sample(self, stream, seed, episode, step, bin_size, mix=None):
         if stream != "test":
-            return self.drawn.sample(stream, seed, episode, step, bin_size, **self.of_mix(mix))
+            return self.drawn.sample(stream, seed, episode, step, bin_size, **self.mix_arguments(mix))
         device, number = step.device, episode % len(self._lengths)
         left = constant_on(self._lengths, device)[number] - step
         index = torch.where(left > 0, constant_on(self._starts, device)[number] + step, 0)
@@ -92,7 +92,7 @@ class Published(ItemDistribution):
         return torch.cat([self.drawn.arrives(mix), torch.ones(len(self._first), dtype=torch.bool)])
 
     def spread(self, seed, rank, count, bin_size, mix=None):
-        return self.drawn.spread(seed, rank, count, bin_size, **self.of_mix(mix))
+        return self.drawn.spread(seed, rank, count, bin_size, **self.mix_arguments(mix))
 
     def label(self, kind):
         known = kind not in self._first

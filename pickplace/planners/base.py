@@ -104,9 +104,9 @@ def narrow_first(cell: CellSpec, item: Item, values: Tensor) -> Tensor:
         item: all items, ``[N * M]``.
         values: of the choices.
     """
-    if cell.parities == 1:
+    if cell.footprint_turns == 1:
         return values
-    each = values.reshape(len(item.w), cell.parities, -1)
+    each = values.reshape(len(item.w), cell.footprint_turns, -1)
     return torch.where((item.w > item.d)[:, None, None], each.flip(1), each).view(values.shape)
 
 

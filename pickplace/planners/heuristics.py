@@ -219,11 +219,9 @@ class IndividualHeuristic(MapPlanner):
         allowed, footprint = footprint >= 0, footprint.clamp(min=0)
         if self.candidates == "corners":
             allowed &= corner_footprints(cell, state.heights, maps).flatten(1).gather(1, footprint)
-        parity = (
-            torch.arange(cell.num_footprints, device=footprint.device).expand(len(footprint), -1) // cell.num_places
-        )
-        order = dbl_order(cell, maps.top).flatten(1) * cell.parities + narrow_first(cell, maps.item, parity)
-        order = order.gather(1, footprint)
+        turned = torch.arange(cell.num_footprints, device=footprint.device) // cell.num_places
+        order = dbl_order(cell, maps.top).flatten(1) * cell.footprint_turns
+        order = (order + narrow_first(cell, maps.item, turned.expand(len(footprint), -1))).gather(1, footprint)
         # Those that succeed, in order; then those that fail, in order; ties by the lowest flat index.
         order = torch.where(allowed, order + FAR * ~(succeeds & allowed) * cell.num_footprints, FAR**2)
         return join_pick(cell, pick, order.argmin(1))
@@ -244,14 +242,14 @@ def corner_footprints(cell: CellSpec, heights: Tensor, maps: PlacingMaps) -> Ten
     sides = item.w[:, None, None], item.d[:, None, None]
     for z in level[top >= 0].unique().tolist():
         free = heights <= z
-        for parity, (w, d) in enumerate((sides, sides[::-1])[: cell.parities]):
-            on_level = (level[:, parity] == z) & (top[:, parity] >= 0)
+        for quarter_turned, (w, d) in enumerate((sides, sides[::-1])[: cell.footprint_turns]):
+            on_level = (level[:, quarter_turned] == z) & (top[:, quarter_turned] >= 0)
             for axes in ((), (1,), (2,), (1, 2)):
                 # The corner at which both coordinates are least, after flipping the tote.
                 corner = _least_corners(free.flip(axes), w, d).flip(axes)
                 for axis in axes:  # from the footprint's last cell to its first
                     corner = _shift(corner, axis, (w, d)[axis - 1] - 1)
-                found[:, parity] |= corner & on_level
+                found[:, quarter_turned] |= corner & on_level
     return found
 
 

@@ -212,6 +212,6 @@ class _Imagined(ItemDistribution):
         self.has_corners, self.mixes = items.has_corners, items.mixes
 
     def sample(self, stream: str, seed: Tensor, episode: Tensor, step: Tensor, bin_size, mix=None) -> Item:
-        item = self.items.sample(stream, seed, episode, step, bin_size, **self.items.of_mix(mix))
-        first = self.items.spread(seed, episode, self.count, bin_size, **self.items.of_mix(mix))
+        item = self.items.sample(stream, seed, episode, step, bin_size, **self.items.mix_arguments(mix))
+        first = self.items.spread(seed, episode, self.count, bin_size, **self.items.mix_arguments(mix))
         return Item(*(torch.where(step == 0, *parts) for parts in zip(first, item, strict=True)))

@@ -70,8 +70,8 @@ class MCTS(MapPlanner):
     Each simulation walks down by UCB1, tries one action that has not been tried, samples the bin that arrives, and
     plays uniformly at random to the end. At most ``visits ** widening`` bins after an action are sampled from the item
     distribution, so that the tree grows deeper than one step. The stream that is played is never used. Items that were
-    not taken stay in the bin. Simulations advance together on the environment's rules; those of one wave see each
-    other's visits, but not yet their returns.
+    not taken stay in the bin. Simulations advance together on the environment's rules, ``batch_simulations`` at a
+    time; these see each other's visits, but not yet their returns.
 
     Args:
         cell: the sizes.
@@ -81,7 +81,7 @@ class MCTS(MapPlanner):
             as in the paper, in the tree and in the rollouts.
         exploration: weight of UCB1's second term; returns are shares of the tote's volume.
         widening: exponent of the number of bins sampled after an action.
-        wave: number of simulations that advance together, over all problems that are searched at once.
+        batch_simulations: number of simulations that advance together, over all problems that are searched at once.
         seed: of the search.
     """
 
@@ -96,12 +96,12 @@ class MCTS(MapPlanner):
         mask: bool = False,
         exploration: float = 0.5,
         widening: float = 0.5,
-        wave: int = 256,
+        batch_simulations: int = 256,
         seed: int = 0,
     ):
         self.cell, self.items, self.mask = cell, search_items(items), flag("planner.mask", mask)
         self.simulations = whole_number("planner.simulations", simulations, most=MAX_NODES)
-        self.wave = whole_number("planner.wave", wave, most=4_096)
+        self.batch_simulations = whole_number("planner.batch_simulations", batch_simulations, most=4_096)
         self.exploration = number("planner.exploration", exploration, most=1e6)
         self.widening = number("planner.widening", widening, most=1)
         self.seed = check_seed(seed, "planner.seed")
@@ -128,7 +128,7 @@ class MCTS(MapPlanner):
             parts = torch.arange(len(state.surface)).split(at_once)
             return torch.cat([self._search(state.rows(part), None if mask is None else mask[part]) for part in parts])
         roots = self._nodes(state, mask)
-        each = max(1, self.wave // len(roots))
+        each = max(1, self.batch_simulations // len(roots))
         for done in range(0, self.simulations, each):
             walks = [
                 (problem, *self._walk_down(root))

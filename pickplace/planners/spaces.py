@@ -136,17 +136,17 @@ class SpacePlanner(MapPlanner):
         """Return for each footprint the least order of a space at whose origin it lies, else :data:`LAST`, int64
         ``[N * M, Q, W_T, D_T]``."""
         spaces, item, bins = empty_spaces(state.heights, maps.level_step), state.items.flatten(), maps.bin_items
-        order = torch.full((len(item.w), cell.parities, *cell.tote_size[:2]), LAST, device=item.w.device)
+        order = torch.full((len(item.w), cell.footprint_turns, *cell.tote_size[:2]), LAST, device=item.w.device)
         row, floor, x0, y0, x1, y1 = (part[:, None] for part in spaces)
         number = row * bins + torch.arange(bins, device=row.device)  # of each item in the bin, [S, M]
         low_enough = floor + item.h[number] <= state.tote_height[row]
-        for parity in range(cell.parities):
-            w, d = (side[number] for side in (item.w, item.d)[:: 1 - 2 * parity])
+        for quarter_turned in range(cell.footprint_turns):
+            w, d = (side[number] for side in (item.w, item.d)[:: 1 - 2 * quarter_turned])
             left_x, left_y = x1 - x0 - w, y1 - y0 - d
             fits = (left_x >= 0) & (left_y >= 0) & low_enough
             usable = fits if self.holds_item else torch.ones_like(fits)
             found = torch.where(usable, self.space_order(floor, left_x, left_y), LAST)
-            at = footprint_index(cell.tote_size, number * cell.parities + parity, x0, y0)
+            at = footprint_index(cell.tote_size, number * cell.footprint_turns + quarter_turned, x0, y0)
             order.view(-1).scatter_reduce_(0, at.flatten(), found.flatten(), "amin")
         return order
 

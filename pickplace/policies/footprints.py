@@ -31,8 +31,8 @@ from pickplace.rules.step import apply
 
 #: Formula of an index of the scores of all footprints.
 FOOTPRINT_INDEX = (
-    "(parity * W_T + x) * D_T + y: first cell of the item in the tote; parity 1: turned by 90 degrees; of several "
-    "items one after the other"
+    "(quarter_turned * W_T + x) * D_T + y: first cell of the item in the tote; quarter_turned 1: turned by 90 degrees; "
+    "of several items one after the other"
 )
 
 
@@ -53,10 +53,10 @@ def rank_footprints(cell: CellSpec, maps: PlacingMaps, scores: Tensor) -> Rankin
     return Ranking(best, scores, lambda row, choice: first_action_reaching(cell, maps.rows(row), choice))
 
 
-def every_footprint(tote_depth: Tensor, parities: int) -> tuple[Tensor, Tensor]:
-    """Return row and index of every footprint of totes ``[N, W_T, D_T]``, int64 ``[N * parities * W_T * D_T]`` each."""
+def every_footprint(tote_depth: Tensor, turns: int) -> tuple[Tensor, Tensor]:
+    """Return row and index of every footprint of totes ``[N, W_T, D_T]``, int64 ``[N * Q * W_T * D_T]`` each."""
     batch, wide, long = tote_depth.shape  # not len(), which torch.export would turn into a constant
-    row, footprint = (torch.arange(size, device=tote_depth.device) for size in (batch, parities * wide * long))
+    row, footprint = (torch.arange(size, device=tote_depth.device) for size in (batch, turns * wide * long))
     return row[:, None].expand(batch, footprint.shape[0]).flatten(), footprint.expand(batch, -1).flatten()
 
 
@@ -94,10 +94,11 @@ class FootprintScorer(Policy):
 
         Args:
             row: int64 ``[M]``, index of the problem.
-            footprint: int64 ``[M]``, index ``(parity * W_T + x) * D_T + y``; with several items, index of the choice.
+            footprint: int64 ``[M]``, index ``(quarter_turned * W_T + x) * D_T + y``; with several items,
+                index of the choice.
         """
         bins, totes, bearing = (observation[key] for key in MAP_KEYS)
-        places = self.cell.parities * totes.shape[1] * totes.shape[2]
+        places = self.cell.footprint_turns * totes.shape[1] * totes.shape[2]
         contents = Contents(items_from_observation(observation), footprint // places)
         return self.network.at(bins, totes, bearing, row, footprint - contents.number * places, contents)[:, 0]
 
@@ -113,8 +114,8 @@ class FootprintScorer(Policy):
     def unmasked_scores(self, observation: Observation) -> Tensor:
         """Return the scores of all footprints, float32 ``[N, scores]``; bins and totes may have any size."""
         totes, items = observation["tote_depth"], items_from_observation(observation)
-        parities = self.cell.parities * items.x.shape[1]  # of each item
-        return self.scores(observation, *every_footprint(totes, parities)).view(totes.shape[0], -1)
+        turns = self.cell.footprint_turns * items.x.shape[1]  # of each item
+        return self.scores(observation, *every_footprint(totes, turns)).view(totes.shape[0], -1)
 
     def choice_logits(self, observation: Observation, choices: Tensor) -> Tensor:
         row = torch.arange(len(choices), device=choices.device).repeat_interleave(choices.shape[1])

@@ -99,8 +99,8 @@ class Problem(ABC):
         number = self.taken_items(action)
         item = select_item(self.state.items, number)
         _, rotation, _, (x, y, *_) = carry(self.cell, item, action)
-        parity = rotation % 2 * (item.w != item.d)  # masks have a square footprint under parity 0
-        return number * self.cell.num_footprints + footprint_index(self.cell.tote_size, parity, x, y)
+        quarter_turned = rotation % 2 * (item.w != item.d)  # masks have a square footprint under quarter_turned 0
+        return number * self.cell.num_footprints + footprint_index(self.cell.tote_size, quarter_turned, x, y)
 
     @property
     def insets(self) -> list[tuple[int, int]]:

@@ -153,22 +153,22 @@ def find_room(cell: CellSpec, item: Item, others: Item, keeps_place: Tensor, uni
     return item._replace(x=place // bin_d, y=place % bin_d).map(lambda part: torch.where(found, part, 0))
 
 
-def may_arrive(cell: CellSpec, items: Item, differs: Episode) -> Tensor:
+def may_arrive(cell: CellSpec, items: Item, settings: Episode) -> Tensor:
     """Return whether items may arrive in the bins ``[N, M]`` now, bool ``[N]``; a batch only in empty bins.
 
     Args:
         cell: has the refill rule, unless episodes differ in it.
         items: ``[N, M]``.
-        differs: settings in which the episodes differ.
+        settings: those in which the episodes differ.
     """
-    waits = cell.refill == "batch" if differs.refill is None else differs.refill == REFILLS.index("batch")
+    waits = cell.refill == "batch" if settings.refill is None else settings.refill == REFILLS.index("batch")
     return ~(items.exists[:, 0] & waits)
 
 
-def is_below_limit(items: Item, differs: Episode) -> Tensor:
+def is_below_limit(items: Item, settings: Episode) -> Tensor:
     """Return whether the bins ``[N, M]`` hold fewer items than they may, bool ``[N]``."""
     below = ~items.exists[:, -1]
-    return below if differs.bin_items is None else below & (items.exists.sum(1) < differs.bin_items)
+    return below if settings.bin_items is None else below & (items.exists.sum(1) < settings.bin_items)
 
 
 def let_in(cell: CellSpec, state: State) -> tuple[State, Tensor]:
@@ -178,13 +178,13 @@ def let_in(cell: CellSpec, state: State) -> tuple[State, Tensor]:
     In an empty bin an item lies at its own place, as in the environment. In any other bin it lies at the first free
     place; the environment draws one at random.
     """
-    _, _, items, differs, _, coming = state
-    awaits = may_arrive(cell, items, differs)  # asked once: the items of a batch arrive together
+    _, _, items, settings, _, coming = state
+    awaits = may_arrive(cell, items, settings)  # asked once: the items of a batch arrive together
     if coming is None:
-        return state, awaits & is_below_limit(items, differs)
+        return state, awaits & is_below_limit(items, settings)
     open_, first = awaits, torch.zeros_like(state.tote_height)
     for _ in range(items.x.shape[1]):
-        open_ = open_ & is_below_limit(items, differs)
+        open_ = open_ & is_below_limit(items, settings)
         item = select_item(coming, first)
         if must_share(items, open_):
             item = find_room(cell, item, items, ~items.exists[:, 0], first.double())
@@ -192,5 +192,5 @@ def let_in(cell: CellSpec, state: State) -> tuple[State, Tensor]:
         if not any_of(open_):
             break
         items, coming = add_item(items, item, open_), remove_item(cell, coming, first, open_)
-    awaits = awaits & is_below_limit(items, differs) & ~coming.exists[:, 0]
+    awaits = awaits & is_below_limit(items, settings) & ~coming.exists[:, 0]
     return state._replace(items=items, coming=coming), awaits

@@ -156,14 +156,14 @@ class CellSpec:
         return self.num_picks * self.num_places * self.rotations
 
     @property
-    def parities(self) -> int:
-        """``Q``: 1 if items are never turned, else 2; parity 1 turns footprint and end effector by 90 degrees."""
+    def footprint_turns(self) -> int:
+        """``Q``: 1 if items are never turned, else 2: footprint and effector as they are, or turned by 90 degrees."""
         return 1 if self.rotations == 1 else 2
 
     @property
     def num_footprints(self) -> int:
-        """The number of footprints ``(parity, x, y)``; an action leaves the item on one of them."""
-        return self.parities * self.num_places
+        """The number of footprints ``(quarter_turned, x, y)``; an action leaves the item on one of them."""
+        return self.footprint_turns * self.num_places
 
     @property
     def num_choices(self) -> int:

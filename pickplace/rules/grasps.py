@@ -2,8 +2,8 @@
 
 A pick affects the placement only through its *grasp class*: the turn and the item's offset under the end effector. Many
 pick cells and rotations share a class, which keeps the masks over all actions cheap. ``O`` offsets are possible along
-one axis, ``K = O * O`` in all. A turn is a parity if rotations that differ by 180 degrees are equivalent for the end
-effector, the robot's limits and the item. Else it is a rotation.
+one axis, ``K = O * O`` in all. There are two turns, 0 and 90 degrees, if rotations that differ by 180 degrees are
+equivalent for the end effector, the robot's limits and the item. Else each rotation is a turn.
 """
 
 from collections.abc import Sequence
@@ -97,12 +97,12 @@ def carry(
         and of the item, int64 ``[A]`` each.
     """
     (ee_w, ee_d), (x_bin, y_bin, x_tote, y_tote, rotation) = cell.gripper.size, split_action(cell, action)
-    odd = rotation % 2 == 1
+    quarter_turned = rotation % 2 == 1
     picked = grasp(cell, item, x_bin, y_bin, blocked)
     turned = zip(*turn(picked.near_x, picked.near_y, picked.back_x, picked.back_y)[: cell.rotations], strict=True)
     offset_x, offset_y = (torch.stack(offsets).gather(0, rotation[None])[0] for offsets in turned)
-    w, d = turned_size(item, odd)
-    wide, deep = torch.where(odd, ee_d, ee_w), torch.where(odd, ee_w, ee_d)
+    w, d = turned_size(item, quarter_turned)
+    wide, deep = torch.where(quarter_turned, ee_d, ee_w), torch.where(quarter_turned, ee_w, ee_d)
     left, front = x_tote - reference_cell(wide), y_tote - reference_cell(deep)
     return picked, rotation, (left, front, wide, deep), (left + offset_x, front + offset_y, w, d)
 
@@ -131,23 +131,24 @@ def join_pick(cell: CellSpec, pick: Tensor, place_rotation: Tensor | int) -> Ten
     return pick * (cell.num_places * cell.rotations) + place_rotation
 
 
-def footprint_index(tote_size: Sequence[int], parity: Tensor | int, x: Tensor, y: Tensor) -> Tensor:
-    """Return the index ``(parity * W_T + x) * D_T + y`` of a footprint with its minimum corner at ``(x, y)``."""
+def footprint_index(tote_size: Sequence[int], quarter_turned: Tensor | int, x: Tensor, y: Tensor) -> Tensor:
+    """Return the index ``(quarter_turned * W_T + x) * D_T + y`` of a footprint whose minimum corner is ``(x, y)``."""
     tote_w, tote_d = tote_size[:2]
-    return (parity * tote_w + x) * tote_d + y
+    return (quarter_turned * tote_w + x) * tote_d + y
 
 
 def split_footprint(tote_size: Sequence[int], footprint: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return parity, x and y of a footprint: the inverse of :func:`footprint_index`."""
+    """Return ``quarter_turned``, x and y of a footprint: the inverse of :func:`footprint_index`."""
     tote_w, tote_d = tote_size[:2]
     line = footprint // tote_d
-    parity = line // tote_w
-    return parity, line - parity * tote_w, footprint - line * tote_d  # ONNX has no % by a size that is not a constant
+    quarter_turned = line // tote_w
+    # ONNX has no % by a size that is not a constant.
+    return quarter_turned, line - quarter_turned * tote_w, footprint - line * tote_d
 
 
-def turned_size(item: Item, odd: Tensor) -> tuple[Tensor, Tensor]:
-    """Return width and depth of the item's footprint; ``odd``: whether it is turned by 90 degrees."""
-    return torch.where(odd, item.d, item.w), torch.where(odd, item.w, item.d)
+def turned_size(item: Item, quarter_turned: Tensor) -> tuple[Tensor, Tensor]:
+    """Return width and depth of the item's footprint; ``quarter_turned``: whether it is turned by 90 degrees."""
+    return torch.where(quarter_turned, item.d, item.w), torch.where(quarter_turned, item.w, item.d)
 
 
 # ---------------------------------------------------------------------- all picks at once
@@ -202,14 +203,14 @@ def num_turns(cell: CellSpec) -> int:
     """Return the number of distinct turns; the turn of a rotation is its remainder.
 
     Turns are rotations if limits may apply to a rotation but not to its half turn, or a half turn changes the body.
-    Else they are parities.
+    Else they are quarter turns.
     """
     return num_grasp_turns(cell) if cell.limits is None and not cell.forbids_turns else cell.rotations
 
 
 def num_grasp_turns(cell: CellSpec) -> int:
     """Return the number of distinct turns without limits on rotations."""
-    return max(cell.parities, len(cell.effectors))
+    return max(cell.footprint_turns, len(cell.effectors))
 
 
 def class_index(cell: CellSpec, turns: Tensor | int, step_x: Tensor, step_y: Tensor) -> Tensor:

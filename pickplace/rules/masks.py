@@ -1,8 +1,8 @@
 """Masks: which actions succeed, and which footprints some action reaches.
 
-Symbols used in shapes: ``N`` problems, ``P`` pick cells, ``R`` rotations, ``Q`` parities of a rotation, ``K`` offsets
-of the item under the end effector, ``T`` turns and ``T * K`` grasp classes (see :mod:`pickplace.rules.grasps`), ``B``
-distinct shapes of the turned end effector (see :attr:`pickplace.rules.cell.CellSpec.effectors`).
+Symbols used in shapes: ``N`` problems, ``P`` pick cells, ``R`` rotations, ``Q`` quarter turns of a footprint, ``K``
+offsets of the item under the end effector, ``T`` turns and ``T * K`` grasp classes (see :mod:`pickplace.rules.grasps`),
+``B`` distinct shapes of the turned end effector (see :attr:`pickplace.rules.cell.CellSpec.effectors`).
 
 Two properties make the check of all ``N_a = P * W_T * D_T * R`` actions cheap. The bin matters only through the grasp
 class. And the end effector collides if and only if something under it is higher than the item's top, where the rim is a
@@ -131,7 +131,7 @@ def _tops_by_offset(cell: CellSpec, maps: PlacingMaps, turn: int) -> Tensor:
     _, _, ref_x, ref_y, _ = cell.effector(turn)
     # With the reference cell at p and the item at offset o, the footprint begins at p - ref + o.
     pad = (ref_x - low, low + count - 1 - ref_x, ref_y - low, low + count - 1 - ref_y)
-    return windows(surround(maps.top[:, turn % cell.parities].permute(1, 2, 0), pad, NEVER), count)
+    return windows(surround(maps.top[:, turn % cell.footprint_turns].permute(1, 2, 0), pad, NEVER), count)
 
 
 def class_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
@@ -202,11 +202,11 @@ def action_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
 
 
 def footprint_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
-    """Return a mask of the footprints that some action reaches, bool ``[N, Q, W_T, D_T]`` by parity and min corner.
+    """Return a mask of the footprints that some action reaches, bool ``[N, Q, W_T, D_T]`` by turn and min corner.
 
     If bins hold several items, there is a mask for each of them, ``[N * M, Q, W_T, D_T]``; see :func:`choice_mask`.
 
-    A square footprint is the same in both parities; it is listed under parity 0 only, so that distinct entries leave
+    A square footprint is the same after a quarter turn; it is listed as not turned only, so that distinct entries leave
     distinct totes.
     """
     batch, count, turns = len(maps.top), cell.num_offsets, num_turns(cell)
@@ -215,14 +215,14 @@ def footprint_mask(cell: CellSpec, maps: PlacingMaps) -> Tensor:
     grasped = available.new_zeros(turns * count**2 + 1, batch)
     grasped.scatter_(0, torch.where(available, classes, len(grasped) - 1).flatten(0, 1), True)
     grasped = grasped[:-1].view(turns, count, count, 1, 1, batch)
-    reached = available.new_empty(cell.parities, *cell.tote_size[:2], batch)
-    for parity in range(cell.parities):
+    reached = available.new_empty(cell.footprint_turns, *cell.tote_size[:2], batch)
+    for quarter_turned in range(cell.footprint_turns):
         if maps.greatest_top is None:
-            top = maps.top[:, parity].permute(1, 2, 0)
-            torch.ge(top, _least_clearance(cell, maps, parity, grasped), out=reached[parity])
+            top = maps.top[:, quarter_turned].permute(1, 2, 0)
+            torch.ge(top, _least_clearance(cell, maps, quarter_turned, grasped), out=reached[quarter_turned])
         else:
-            reached[parity] = _reached_within_limits(cell, maps, maps.greatest_top, parity, grasped)
-    if cell.parities == 2:
+            reached[quarter_turned] = _reached_within_limits(cell, maps, maps.greatest_top, quarter_turned, grasped)
+    if cell.footprint_turns == 2:
         square = maps.item.w == maps.item.d
         reached[0] |= square & reached[1]
         reached[1] &= ~square
@@ -241,22 +241,22 @@ def _reference_cells(shapes: tuple[EffectorShape, ...], rotations: int, device: 
     return torch.tensor([(shape.ref_x, shape.ref_y) for shape in turned], device=device)
 
 
-def _footprint_margins(cell: CellSpec, parity: int) -> tuple[int, int, int, int]:
+def _footprint_margins(cell: CellSpec, quarter_turned: int) -> tuple[int, int, int, int]:
     """Return margins after which window ``(i, j)`` of a map over place cells belongs to offset ``O - 1 - (i, j)``.
 
     The footprint at f is reached with offset o if the reference cell is at f + ref - o.
     """
-    _, _, ref_x, ref_y, _ = cell.effector(parity)
+    _, _, ref_x, ref_y, _ = cell.effector(quarter_turned)
     low, high = cell.min_offset, cell.min_offset + cell.num_offsets - 1
     return high - ref_x, ref_x - low, high - ref_y, ref_y - low
 
 
-def _least_clearance(cell: CellSpec, maps: PlacingMaps, parity: int, grasped: Tensor) -> Tensor:
+def _least_clearance(cell: CellSpec, maps: PlacingMaps, quarter_turned: int, grasped: Tensor) -> Tensor:
     """Return the least clearance with which any grasp reaches each footprint, ``[W_T, D_T, N]``; FAR if none does."""
     (tote_w, tote_d, _), count = cell.tote_size, cell.num_offsets
-    margins = _footprint_margins(cell, parity)
+    margins = _footprint_margins(cell, quarter_turned)
     least = []
-    for turn in range(parity, len(grasped), 2):
+    for turn in range(quarter_turned, len(grasped), 2):
         clear, kinds = surround(maps.clearance_in(turn), margins, FAR), grasped[turn].flip(0, 1)  # in windows' order
         if (
             count > 3
@@ -280,13 +280,13 @@ def _far_unless(used: Tensor) -> Tensor:
 
 
 def _reached_within_limits(
-    cell: CellSpec, maps: PlacingMaps, greatest_top: Tensor, parity: int, grasped: Tensor
+    cell: CellSpec, maps: PlacingMaps, greatest_top: Tensor, quarter_turned: int, grasped: Tensor
 ) -> Tensor:
-    """Return a mask of the footprints that some grasp of a parity reaches within the limits, bool ``[W_T, D_T, N]``."""
-    (tote_w, tote_d, _), margins = cell.tote_size, _footprint_margins(cell, parity)
-    top = maps.top[:, parity].permute(1, 2, 0)
+    """Return a mask of the footprints, turned or not, that some grasp reaches within the limits, ``[W_T, D_T, N]``."""
+    (tote_w, tote_d, _), margins = cell.tote_size, _footprint_margins(cell, quarter_turned)
+    top = maps.top[:, quarter_turned].permute(1, 2, 0)
     reached = torch.zeros_like(top, dtype=torch.bool)
-    for rotation in range(parity, cell.rotations, 2):
+    for rotation in range(quarter_turned, cell.rotations, 2):
         clear = surround(maps.clearance_in(rotation), margins, FAR)
         highest = surround(greatest_top[:, rotation].permute(1, 2, 0), margins, NEVER)
         kinds = grasped[rotation].flip(0, 1)  # in windows' order
@@ -302,8 +302,8 @@ def actions_reaching(cell: CellSpec, maps: PlacingMaps, footprint: Tensor) -> Te
     """Return all successful flat actions that leave the item in a given footprint.
 
     Args:
-        footprint: int64 ``[N]``, index ``(parity * W_T + x) * D_T + y``; with several items in a bin the choice,
-            ``item * num_footprints + footprint``.
+        footprint: int64 ``[N]``, index ``(quarter_turned * W_T + x) * D_T + y``; with several items in a bin the
+            choice, ``item * num_footprints + footprint``.
 
     Returns:
         int64 ``[N, P * R]``: for each pick cell and rotation the flat action, or -1 if it does not succeed.
@@ -342,8 +342,8 @@ def first_action_reaching(cell: CellSpec, maps: PlacingMaps, footprint: Tensor) 
 def action_footprints(cell: CellSpec, items: Item, blocked: Tensor | None = None) -> Tensor:
     """Return the footprint that each flat action would leave if nothing collided, int64 ``[N, N_a]``.
 
-    The value is ``item * num_footprints + footprint`` as in :func:`actions_reaching`, with square footprints under
-    parity 0; -1 where the pick fails or the footprint leaves the tote.
+    The value is ``item * num_footprints + footprint`` as in :func:`actions_reaching`, with square footprints as not
+    turned; -1 where the pick fails or the footprint leaves the tote.
 
     Args:
         cell: the sizes.
@@ -362,8 +362,8 @@ def action_footprints(cell: CellSpec, items: Item, blocked: Tensor | None = None
     y = corner[..., 1] + torch.arange(tote_d, device=device)[:, None]
     w, d = (size[:, None, None, None] for size in turned_size(item.rows((slice(None), None)), turned == 1))
     inside = ~is_outside(x, w, tote_w) & ~is_outside(y, d, tote_d)
-    parity = (turned * (item.w != item.d)[:, None])[:, None, None, None]
+    quarter_turned = (turned * (item.w != item.d)[:, None])[:, None, None, None]
     number = (torch.arange(len(lifted), device=device) % count)[:, None, None, None, None]
-    footprint = footprint_index(cell.tote_size, parity, x, y) + number * cell.num_footprints
+    footprint = footprint_index(cell.tote_size, quarter_turned, x, y) + number * cell.num_footprints
     footprint = torch.where(inside & lifted[..., None, None, None], footprint, -1).flatten(1)
     return footprint if count == 1 else footprint.unflatten(0, (-1, count)).amax(1)  # a pick lifts one item at most

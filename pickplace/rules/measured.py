@@ -83,12 +83,11 @@ def measured_maps(
     """
     slack = tote.accuracy
     z = OnFootprints(cell, tote.state(cell, item).surface, *footprint_sizes(cell, item)).z[..., 0]  # [Q, W_T, D_T]
-    stable = torch.stack([_is_stable(cell, tote, item, sides, parity, z[parity]) for parity in range(cell.parities)])
+    stable = torch.stack([_is_stable(cell, tote, item, sides, turned, each) for turned, each in enumerate(z)])
     borne = None
     if loads is not None:
-        parts = [_is_borne(item, sides, parity, z[parity], loads) for parity in range(cell.parities)]
-        borne = torch.stack(parts)
-    if int(item.w) == int(item.d):  # the masks have one footprint for both parities
+        borne = torch.stack([_is_borne(item, sides, turned, each, loads) for turned, each in enumerate(z)])
+    if int(item.w) == int(item.d):  # the masks have one footprint for both turns
         stable = stable.all(0).expand_as(stable)
         borne = None if borne is None else borne.all(0).expand_as(borne)
     top, highest = z + item.h.to(z.dtype), tote.height - 2 * slack
@@ -147,10 +146,12 @@ def _contact(
     )
 
 
-def _oriented(item: Item, sides: tuple[float, float], parity: int) -> tuple[tuple[int, int], tuple[float, float]]:
-    """Return the footprint's sides in whole cells and the item's own sides, in a parity."""
+def _oriented(
+    item: Item, sides: tuple[float, float], quarter_turned: int
+) -> tuple[tuple[int, int], tuple[float, float]]:
+    """Return the footprint's sides in whole cells and the item's own sides, turned or not."""
     footprint = int(item.w), int(item.d)
-    return (footprint[::-1], sides[::-1]) if parity else (footprint, sides)
+    return (footprint[::-1], sides[::-1]) if quarter_turned else (footprint, sides)
 
 
 def _inside(z: Tensor, footprint: tuple[int, int]) -> tuple[slice, slice]:
@@ -160,10 +161,10 @@ def _inside(z: Tensor, footprint: tuple[int, int]) -> tuple[slice, slice]:
 
 
 def _is_stable(
-    cell: CellSpec, tote: MeasuredTote, item: Item, sides: tuple[float, float], parity: int, z: Tensor
+    cell: CellSpec, tote: MeasuredTote, item: Item, sides: tuple[float, float], quarter_turned: int, z: Tensor
 ) -> Tensor:
-    """Return whether the item is stable on every footprint of a parity, bool ``[W_T, D_T]``."""
-    footprint, sides = _oriented(item, sides, parity)
+    """Return whether the item, turned or not, is stable on every footprint, bool ``[W_T, D_T]``."""
+    footprint, sides = _oriented(item, sides, quarter_turned)
     stable = torch.zeros_like(z, dtype=torch.bool)
     inside = _inside(z, footprint)
     z = z[inside]
@@ -176,9 +177,9 @@ def _is_stable(
     return stable
 
 
-def _is_borne(item: Item, sides: tuple[float, float], parity: int, z: Tensor, loads: MeasuredLoads) -> Tensor:
-    """Return whether the items below bear the item on every footprint of a parity, bool ``[W_T, D_T]``."""
-    footprint, _ = _oriented(item, sides, parity)
+def _is_borne(item: Item, sides: tuple[float, float], quarter_turned: int, z: Tensor, loads: MeasuredLoads) -> Tensor:
+    """Return whether the items below bear the item, turned or not, on every footprint, bool ``[W_T, D_T]``."""
+    footprint, _ = _oriented(item, sides, quarter_turned)
     borne = torch.zeros_like(z, dtype=torch.bool)
     inside = _inside(z, footprint)
     if (z := z[inside]).numel():
@@ -192,12 +193,12 @@ def bearing_after(
     """Return a mask of the cells that bear weight once the item lies on a footprint, bool ``[W_T, D_T]``.
 
     Args:
-        footprint: index ``(parity * W_T + x) * D_T + y``.
+        footprint: index ``(quarter_turned * W_T + x) * D_T + y``.
     """
     tote_w, tote_d, _ = cell.tote_size
-    parity, x, y = footprint // (tote_w * tote_d), footprint // tote_d % tote_w, footprint % tote_d
-    size, sides = _oriented(item, sides, parity)
-    z = maps.maps.rest[0, parity, x : x + 1, y : y + 1]
+    quarter_turned, x, y = footprint // (tote_w * tote_d), footprint // tote_d % tote_w, footprint % tote_d
+    size, sides = _oriented(item, sides, quarter_turned)
+    z = maps.maps.rest[0, quarter_turned, x : x + 1, y : y + 1]
     count = tote.highest.shape[0] // tote_w
     shifted = tote._replace(lowest=tote.lowest[x * count :, y * count :], bears=tote.bears[x:, y:])
     contact = _contact(cell, shifted, size, sides, z)

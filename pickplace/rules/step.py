@@ -93,11 +93,11 @@ def put_down(cell: CellSpec, state: State, choice: Tensor) -> tuple[State, Item]
             :func:`~pickplace.rules.grasps.footprint_index`; some action must reach it.
     """
     wide, deep = state.surface.shape[1:]  # an exported network serves any tote
-    places = cell.parities * wide * deep
+    places = cell.footprint_turns * wide * deep
     taken = choice // places
     item = select_item(state.items, taken)
-    parity, x, y = split_footprint((wide, deep), choice - taken * places)
-    w, d = turned_size(item, parity == 1)
+    quarter_turned, x, y = split_footprint((wide, deep), choice - taken * places)
+    w, d = turned_size(item, quarter_turned == 1)
     on = _contact(cell, state.surface, x, y, w, d)
     surface, pile = _add_item(cell, state.surface, state.pile, item, x, y, *on, item.h)
     return state._replace(surface=surface, items=remove_item(cell, state.items, taken), pile=pile), item

@@ -140,11 +140,11 @@ def test_a_search_imagines_what_may_arrive_in_the_episode(bin_items, monkeypatch
         arrived.clear()
         action = planner.decide(td)
         assert (action % 4)[0] == 0 and (action % 4)[1] <= 1
-        assert 1 in {mix for differs, _ in arrived for mix in differs.item_mix.tolist()}
-        for differs, (found, _) in arrived:
-            small = differs.item_mix == 1
+        assert 1 in {mix for settings, _ in arrived for mix in settings.item_mix.tolist()}
+        for settings, (found, _) in arrived:
+            small = settings.item_mix == 1
             assert (found.volume[small] <= 1).all() and (found.exists.sum(1) <= 1).all()
-            assert (found.turns[found.exists] == differs.turns[:, None].expand_as(found.turns)[found.exists]).all()
+            assert (found.turns[found.exists] == settings.turns[:, None].expand_as(found.turns)[found.exists]).all()
 
 
 def test_a_reset_that_is_refused_changes_nothing():

@@ -37,7 +37,7 @@ LEFT_OUT = ("raise ", 'f"', "lru_cache", "->", "import ", "@", "TypeVar", "Liter
 SAME_RESULT = (
     ("", "BitAnd_Mul"),  # of masks
     ("", "BitOr_Add"),  # of masks
-    ("cell.parities == 2", "Eq_GtE"),  # it is 1 or 2
+    ("cell.footprint_turns == 2", "Eq_GtE"),  # it is 1 or 2
     ("== 1", "Eq_LtE"),  # of counts, which are at least 1
     ("packed, slots =", ""),  # how many flags are copied at once
     ("max_side < LEAST_SIDE", ""),  # which of two ways is taken

@@ -44,14 +44,14 @@ def test_corners_of_maximal_rectangles(seed, wide, deep, steps):
     found = corner_footprints(cell, heights, maps)
     for n in range(3):
         free = {z: list(maximal_rectangles((heights[n] <= z).tolist())) for z in range(steps)}
-        for parity, (wide_, deep_) in enumerate(((int(w[n]), int(d[n])), (int(d[n]), int(w[n])))):
+        for quarter_turned, (wide_, deep_) in enumerate(((int(w[n]), int(d[n])), (int(d[n]), int(w[n])))):
             expected = torch.zeros(wide, deep, dtype=torch.bool)
             for z, rectangles in free.items():
                 for x, y, a, b in rectangles:
                     if a >= wide_ and b >= deep_:
                         for i, j in itertools.product((x, x + a - wide_), (y, y + b - deep_)):
-                            expected[i, j] |= int(maps.top[n, parity, i, j]) == z + int(h[n])
-            assert torch.equal(found[n, parity], expected)
+                            expected[i, j] |= int(maps.top[n, quarter_turned, i, j]) == z + int(h[n])
+            assert torch.equal(found[n, quarter_turned], expected)
 
 
 @pytest.mark.parametrize(("rotations", "reference"), [(1, 0.569), (3, 0.922)])
@@ -83,9 +83,9 @@ def test_the_first_candidate_that_succeeds_is_played(candidates, rotations, tote
         for n, (x, y, w, d) in enumerate(lies[row].tolist()):
             if min(x, y) < 0 or x + w > tote[0] or y + d > tote[1]:
                 continue
-            parity = n % rotations % 2
-            if candidates == "cells" or corners[row, parity, x, y]:
-                found.append((failed[row, n].item() > 0, top[row, parity, x, y].item(), y, x, w > d, n))
+            quarter_turned = n % rotations % 2
+            if candidates == "cells" or corners[row, quarter_turned, x, y]:
+                found.append((failed[row, n].item() > 0, top[row, quarter_turned, x, y].item(), y, x, w > d, n))
         if found:
             assert chosen[row] == min(found)[-1]
             missed += min(found)[0]

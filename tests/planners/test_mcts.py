@@ -22,7 +22,7 @@ def make_env(count=1, **settings):
 
 
 def search_of(env, simulations, **settings):
-    return MCTS(env.cell, env.items, simulations, **{"mask": True, "wave": 512, **settings})
+    return MCTS(env.cell, env.items, simulations, **{"mask": True, "batch_simulations": 512, **settings})
 
 
 @pytest.mark.slow
@@ -40,7 +40,7 @@ def test_more_simulations_come_closer_to_the_optimum():
 def searched(mask, simulations, rollouts=True, **settings):
     """Return the root of the tree of one decision."""
     env, roots = make_env(**{"tote_size": (4, 4, 2), **settings}), []
-    search = search_of(env, simulations, mask=mask, wave=7)
+    search = search_of(env, simulations, mask=mask, batch_simulations=7)
     make = search._nodes
     search._nodes = lambda *args: roots.append(make(*args)) or roots[-1]
     if not rollouts:
@@ -114,7 +114,7 @@ def test_what_is_seen_to_come_is_the_next_bin(mask):
 
 def test_without_a_mask_it_tries_what_fails():
     env = make_env(2)
-    search = search_of(env, 200, mask=False, wave=256)
+    search = search_of(env, 200, mask=False, batch_simulations=256)
     action = search.decide(env.reset())
     assert ((action >= 0) & (action < env.cell.num_actions)).all()
     # With far fewer simulations than actions nothing is tried twice: the paper's setting is nearly a random choice.
@@ -151,7 +151,7 @@ def test_many_problems_are_searched_in_groups(mask, monkeypatch):
     ("settings", "words"),
     [
         ({"simulations": 0}, "planner.simulations=0: expected a whole number >= 1"),
-        ({"wave": 1.5}, "planner.wave=1.5"),
+        ({"batch_simulations": 1.5}, "planner.batch_simulations=1.5"),
         ({"seed": -1}, "planner.seed=-1"),
         ({"exploration": -1}, "planner.exploration=-1: expected a number between 0"),
         ({"widening": 2}, "planner.widening=2: expected a number between 0 and 1"),

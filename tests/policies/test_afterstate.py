@@ -124,8 +124,8 @@ def test_an_action_has_an_even_share_of_its_totes_probability(kind, options):
                 step = apply(env.cell, env.state.rows([row]), torch.tensor([action]))
                 x, y, w, d = step.footprint[0].tolist()
                 item, number = env.state.items.rows((row, int(step.taken))), int(step.taken)
-                parity = int((w, d) != (item.w, item.d))
-                choice = number * env.cell.num_footprints + int(footprint_index(env.cell.tote_size, parity, x, y))
+                turned = int((w, d) != (item.w, item.d))
+                choice = number * env.cell.num_footprints + int(footprint_index(env.cell.tote_size, turned, x, y))
                 leads_to.setdefault(choice, []).append(action)
             expected = torch.zeros(env.cell.num_actions)
             for choice, actions in leads_to.items():

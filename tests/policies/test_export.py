@@ -103,7 +103,7 @@ def test_the_check_is_at_three_sizes_that_the_export_has_not_seen(exported):
         "FcnGrasp",
     )
     assert json.loads(facts["cell"])["tote_size"] == [8, 8, 8] and facts["index"].startswith(
-        "(parity * W_T + x) * D_T + y"
+        "(quarter_turned * W_T + x) * D_T + y"
     )
     shapes = {entry.name: entry.shape for entry in session.get_inputs()}
     assert shapes == {
@@ -165,13 +165,15 @@ def test_any_size_is_what_a_person_would_read_off_the_maps(exported, seed, batch
     (logits,) = exported[0].run(["logits"], {key: part.numpy() for key, part in zip(keys, maps, strict=True)})
     assert logits.shape == (batch, 2 * tote[0] * tote[1])
     network, item = load_policy("pretrained/mixed_grasp").policy.network, item_from_depth(maps[0])
-    row, parity = batch - 1, seed % 2
+    row, quarter_turned = batch - 1, seed % 2
     w, d, h = (int(part[row]) for part in item[2:5])
-    wide, deep = (d, w) if parity else (w, d)
+    wide, deep = (d, w) if quarter_turned else (w, d)
     if wide <= tote[0] and deep <= tote[1]:
         x, y = (tote[0] - wide) // 2, tote[1] - deep
-        expected = by_hand(network, (w, d, h), maps[1][row], maps[2][row], parity, x, y)
-        assert logits[row, (parity * tote[0] + x) * tote[1] + y] == pytest.approx(expected.item(), rel=1e-4, abs=1e-4)
+        expected = by_hand(network, (w, d, h), maps[1][row], maps[2][row], quarter_turned, x, y)
+        assert logits[row, (quarter_turned * tote[0] + x) * tote[1] + y] == pytest.approx(
+            expected.item(), rel=1e-4, abs=1e-4
+        )
 
 
 def test_its_best_feasible_footprint_is_the_planners(exported):

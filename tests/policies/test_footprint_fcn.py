@@ -37,22 +37,22 @@ def random_maps(seed, batch, bin_size, tote_size):
     return bins, totes, torch.randint(0, 2, totes.shape, generator=generator).float()
 
 
-def every_score(network, bins, totes, bearing, parities):
-    """Return the network's scores of all footprints, ``[N, parities, W_T, D_T, out_channels]``."""
-    row, footprint = every_footprint(totes, parities)
+def every_score(network, bins, totes, bearing, footprint_turns):
+    """Return the network's scores of all footprints, ``[N, footprint_turns, W_T, D_T, out_channels]``."""
+    row, footprint = every_footprint(totes, footprint_turns)
     contents = Contents(read_items(bins), torch.zeros_like(row))
     scores = network.at(bins, totes, bearing, row, footprint, contents)
-    return scores.view(len(totes), parities, *totes.shape[1:], -1)
+    return scores.view(len(totes), footprint_turns, *totes.shape[1:], -1)
 
 
-def by_hand(network, item, tote_depth, bearing, parity, x, y):
+def by_hand(network, item, tote_depth, bearing, quarter_turned, x, y):
     """Return the network's scores of one footprint of one problem, read cell by cell off the maps."""
     side, reach, (w, d, h) = network.receptive_field, network.reach, item
     wide, long = tote_depth.shape
 
     def at(i, j):
         """Return the cell at (i, j) along the item's own axes from the footprint's corner; None outside the tote."""
-        cell = (x + j, y + i) if parity else (x + i, y + j)
+        cell = (x + j, y + i) if quarter_turned else (x + i, y + j)
         return cell if 0 <= cell[0] < wide and 0 <= cell[1] < long else None
 
     def depth(i, j):
@@ -106,12 +106,12 @@ def test_it_sees_what_a_person_would_read_off_the_maps(seed, field, tote, sizes,
     scores = every_score(network, bins, totes, bearing, 2)
     assert scores.shape == (2, 2, *tote, 3)
     item, found, expected = item_from_depth(bins), [], []
-    for n, parity in itertools.product(range(2), range(2)):
+    for n, quarter_turned in itertools.product(range(2), range(2)):
         w, d, h = (int(part[n]) for part in item[2:5])
-        wide, deep = (d, w) if parity else (w, d)
+        wide, deep = (d, w) if quarter_turned else (w, d)
         for x, y in itertools.product(range(tote[0] - wide + 1), range(tote[1] - deep + 1)):
-            expected.append(by_hand(network, (w, d, h), totes[n], bearing[n], parity, x, y))
-            found.append(scores[n, parity, x, y])
+            expected.append(by_hand(network, (w, d, h), totes[n], bearing[n], quarter_turned, x, y))
+            found.append(scores[n, quarter_turned, x, y])
     torch.testing.assert_close(torch.stack(found), torch.stack(expected), rtol=1e-4, atol=1e-4)
 
 
@@ -123,7 +123,7 @@ def test_only_what_the_mask_allows_is_computed_and_it_is_the_same(rotations, mon
     monkeypatch.setattr(policy.network, "at", lambda *args: asked.append(len(args[3])) or at(*args))
     logits = policy.logits(state)
     assert asked == [int(mask.sum())] and asked[0] < mask.numel()
-    everywhere = every_score(policy.network, *(state[key] for key in MAP_KEYS), env.cell.parities).flatten(1)
+    everywhere = every_score(policy.network, *(state[key] for key in MAP_KEYS), env.cell.footprint_turns).flatten(1)
     torch.testing.assert_close(logits, torch.where(mask, everywhere, MASKED))
     logits.logsumexp(1).sum().backward()
     unused = [name for name, parameter in policy.named_parameters() if parameter.grad is None]
@@ -151,15 +151,15 @@ def test_without_a_mask_every_grasp_has_the_score_of_its_footprint(rotations, ef
     policy, count = UnmaskedFcnGrasp(env.cell, filters=8, **FLOAT), env.cell.num_offsets
     policy.outside.data.fill_(7.0)
     logits = policy.class_scores(state).flatten(1)
-    scores = every_score(policy.network, *(state[key] for key in MAP_KEYS), env.cell.parities)
-    for parity in range(env.cell.parities):
-        _, _, ref_x, ref_y, _ = env.cell.effector(parity)
+    scores = every_score(policy.network, *(state[key] for key in MAP_KEYS), env.cell.footprint_turns)
+    for quarter_turned in range(env.cell.footprint_turns):
+        _, _, ref_x, ref_y, _ = env.cell.effector(quarter_turned)
         for ox, oy, x, y in itertools.product(range(count), range(count), range(4), range(5)):
             fx, fy = x - ref_x + ox, y - ref_y + oy
-            got = logits[:, ((parity * count + ox) * count + oy) * 20 + x * 5 + y]
+            got = logits[:, ((quarter_turned * count + ox) * count + oy) * 20 + x * 5 + y]
             if 0 <= fx < 4 and 0 <= fy < 5:
-                along, across = (oy, ox) if parity else (ox, oy)
-                torch.testing.assert_close(got, scores[:, parity, fx, fy, along * count + across])
+                along, across = (oy, ox) if quarter_turned else (ox, oy)
+                torch.testing.assert_close(got, scores[:, quarter_turned, fx, fy, along * count + across])
             else:
                 assert (got == 7.0).all()
 

@@ -15,26 +15,26 @@ from pickplace.rules.state import surface_from
 
 
 def plain_corners(heights, sizes, feasible, free, level_step):
-    """Return the feasible (parity, x, y) that are blocked along both axes, cell by cell; the fallback if there is none.
+    """Return the feasible (turned, x, y) that are blocked along both axes, cell by cell; the fallback if there is none.
 
     Args:
         heights: ``[W][D]``.
-        sizes: the footprint's sides for each parity.
-        feasible: a set of (parity, x, y).
+        sizes: the footprint's sides, as it is and turned by 90 degrees.
+        feasible: a set of (turned, x, y).
         free: the same of those at which nothing is hit, stable or not.
         level_step: by how much the heights of a level surface may differ.
     """
     wide, deep = len(heights), len(heights[0])
 
-    def rest(parity, x, y):
-        w, d = sizes[parity]
+    def rest(quarter_turned, x, y):
+        w, d = sizes[quarter_turned]
         if min(x, y) < 0 or x + w > wide or y + d > deep:
             return float("inf")
         return max(heights[i][j] for i in range(x, x + w) for j in range(y, y + d))
 
     def blocked(place, step, free):
-        parity, x, y = place
-        there = parity, x + step[0], y + step[1]
+        quarter_turned, x, y = place
+        there = quarter_turned, x + step[0], y + step[1]
         return rest(*there) > rest(*place) + level_step or there not in free
 
     def corners(free):

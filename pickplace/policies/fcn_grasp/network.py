@@ -97,7 +97,7 @@ class FootprintFcn(nn.Module):
             bin_depth, tote_depth: ``[N, W_B, D_B]``, ``[N, W_T, D_T]``.
             bearing: 1 where a cell of the tote bears weight, else 0, ``[N, W_T, D_T]``.
             row: index of the problem, int64 ``[M]``.
-            footprint: index ``(parity * W_T + x) * D_T + y`` of the footprint, int64 ``[M]``.
+            footprint: index ``(quarter_turned * W_T + x) * D_T + y`` of the footprint, int64 ``[M]``.
             contents: the items in the bins, and the number of each footprint's item.
         """
         at_once = CHUNK_BYTES // (4 * self.patch.in_features)
@@ -127,8 +127,8 @@ class FootprintFcn(nn.Module):
         the cells that bear no weight, ``[M, side * side]``."""
         side, reach, (w, d, h) = self.receptive_field, self.reach, sizes
         _, wide, long = tote_depth.shape
-        parity, x, y = split_footprint((wide, long), footprint)
-        turned = parity == 1
+        quarter_turned, x, y = split_footprint((wide, long), footprint)
+        turned = quarter_turned == 1
         # Patches begin some cells before their footprint along the item's own axes, so that it is in their middle.
         before_w, before_d = (reference_cell(side) - reference_cell(size) for size in (w, d))
         margin = side + max(bin_depth.shape[1:])

@@ -65,21 +65,21 @@ class UnmaskedFcnGrasp(Policy):
         (tote_w, tote_d, _), offsets, low = self.cell.tote_size, self.cell.num_offsets, self.cell.min_offset
         step, x, y = torch.arange(offsets), torch.arange(tote_w), torch.arange(tote_d)
         channel, found = torch.arange(offsets**2).view(offsets, offsets, 1, 1), []
-        for turn in range(num_grasp_turns(self.cell)):  # turns of one parity have the same scores
-            parity, shape = turn % 2, self.cell.effector(turn)
+        for turn in range(num_grasp_turns(self.cell)):  # turns of one quarter_turned have the same scores
+            quarter_turned, shape = turn % 2, self.cell.effector(turn)
             left = x[:, None] + (step[:, None, None, None] + low - shape.ref_x)  # [O, 1, W_T, 1]
             front = y + (step[:, None, None] + low - shape.ref_y)  # [O, 1, D_T]
             inside = ~is_outside(left, 1, tote_w) & ~is_outside(front, 1, tote_d)
-            footprint = footprint_index(self.cell.tote_size, parity, left, front)
+            footprint = footprint_index(self.cell.tote_size, quarter_turned, left, front)
             # The network sees a turned footprint along the item's own axes.
-            index = footprint * offsets**2 + (channel.transpose(0, 1) if parity else channel)
+            index = footprint * offsets**2 + (channel.transpose(0, 1) if quarter_turned else channel)
             found.append(torch.where(inside, index, self.cell.num_footprints * offsets**2).flatten(2).flatten(0, 1))
         return torch.cat(found)
 
     def class_scores(self, observation: Observation) -> Tensor:
         """Return a logit for every (grasp class, place cell), ``[N, C, W_T * D_T]``."""
         bins, totes, bearing = (observation[key] for key in MAP_KEYS)
-        row, footprint = every_footprint(totes, self.cell.parities)
+        row, footprint = every_footprint(totes, self.cell.footprint_turns)
         contents = Contents(items_from_observation(observation), torch.zeros_like(row))
         scores = self.network.at(bins, totes, bearing, row, footprint, contents).view(len(totes), -1)
         return torch.cat([scores, self.outside.expand(len(scores), 1)], 1)[:, self.scored]

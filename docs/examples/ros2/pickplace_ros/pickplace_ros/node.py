@@ -154,18 +154,20 @@ class PickPlaceNode(Node):
             NotReady: of the function, at the deadline.
             Canceled: if the client cancels the goal.
         """
-        told = None
+        last_message = None
         while True:
             if goal.is_cancel_requested:
-                raise Canceled(f"cancelled: {told or 'the goal'}")
+                raise Canceled(f"cancelled: {last_message or 'the goal'}")
             try:
                 return find()
             except NotReady as error:
                 if not deadline.left():
                     raise
-                if str(error) != told:
-                    told = str(error)
-                    goal.publish_feedback(ComputePlan.Feedback(stage=ComputePlan.Feedback.WAITING, message=told))
+                if str(error) != last_message:
+                    last_message = str(error)
+                    goal.publish_feedback(
+                        ComputePlan.Feedback(stage=ComputePlan.Feedback.WAITING, message=last_message)
+                    )
             time.sleep(POLL_SECONDS)
 
     def view(self, place: str, arrival: int, wait: Callable[[Callable[[], Found]], Found]) -> View:
