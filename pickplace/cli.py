@@ -6,7 +6,7 @@ import signal
 import sys
 from functools import partial
 
-from pickplace.common.interrupts import end_process, import_quietly, on_interrupt
+from pickplace.common.interrupts import end_process, import_quietly, set_interrupt_handler
 
 # Let waiting threads sleep: a spinning thread would slow down others on its core. OpenMP reads this when torch is
 # loaded.
@@ -21,13 +21,13 @@ def _run(module: str) -> None:
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115  open until the end
     logging.raiseExceptions = False  # else each line prints a traceback on a closed terminal or a full disk
     command = import_quietly(module)
-    on_interrupt(signal.default_int_handler)
+    set_interrupt_handler(signal.default_int_handler)
     try:
         command.main()
     except KeyboardInterrupt:
         sys.exit(130)
     finally:
-        on_interrupt(end_process)
+        set_interrupt_handler(end_process)
 
 
 # Entry points of pickplace-train and so on.

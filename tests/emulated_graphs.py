@@ -95,10 +95,12 @@ class EmulatedTorch:
 
 def emulate(monkeypatch) -> None:
     """Let recorded work go through ``CudaGraphModule`` on the CPU, for a test."""
-    emulated, make = EmulatedTorch(), graphs.Recorded._make_graph
+    emulated, make = EmulatedTorch(), graphs.CapturedWork._make_graph
     monkeypatch.setattr(cudagraphs, "torch", emulated)
     monkeypatch.setattr(graphs.torch.cuda, "set_device", lambda device: None)
     clone = classmethod(lambda cls, x: x.clone() if isinstance(x, torch.Tensor) else x)
     monkeypatch.setattr(cudagraphs.CudaGraphModule, "_check_device_and_clone", clone)
-    monkeypatch.setattr(graphs.Recorded, "_make_graph", lambda self, device: make(self, SimpleNamespace(type="cuda")))
+    monkeypatch.setattr(
+        graphs.CapturedWork, "_make_graph", lambda self, device: make(self, SimpleNamespace(type="cuda"))
+    )
     Graph.replays = 0

@@ -21,7 +21,7 @@ from commands import after_batch, assert_same, composed
 from hydra import compose, initialize_config_dir
 
 from pickplace import Box, CellSpec, PickPlaceEnv, Planner, Scene, load_policy
-from pickplace.algorithms.base import At, Task
+from pickplace.algorithms.base import BatchPosition, Task
 from pickplace.config.composition import conf_dir
 from pickplace.config.registry import build
 from pickplace.items.distributions import Kinds
@@ -272,7 +272,7 @@ def test_dqn_learns_a_mask_and_a_number_by_hand(monkeypatch):
             batch = env.rollout(4, dqn.acting_policy(), break_when_any_done=False)
         for key in ("footprint_mask",):
             assert batch[key].flatten(2).gather(2, batch["footprint"][..., None]).all()
-        metrics = dqn.learn(batch, At(32 * iteration, 32 * iteration + 32, iteration + 1, 256))
+        metrics = dqn.learn(batch, BatchPosition(32 * iteration, 32 * iteration + 32, iteration + 1, 256))
     assert metrics["train/epsilon"] == 0.5 and metrics["train/loss"] < 0.05
     with torch.no_grad():
         value = policy.logits(batch.reshape(-1)).gather(1, batch["footprint"].reshape(-1, 1))

@@ -9,7 +9,7 @@ from torchrl.modules import ValueOperator
 from torchrl.objectives import A2CLoss, ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from pickplace.algorithms.base import At, Task
+from pickplace.algorithms.base import BatchPosition, Task
 from pickplace.algorithms.descent import MAX_WEIGHT, MinibatchDescent
 from pickplace.common.validate import expect, flag, number, refuse_if
 from pickplace.policies.base import EstimatesValue, Policy
@@ -82,11 +82,11 @@ class ActorCritic(MinibatchDescent):
             "expected more frames, or false.",
         )
 
-    def learn(self, batch: TensorDictBase, at: At) -> dict[str, float]:
-        return self.descend(self.prepare(batch, at), at, self.objective)
+    def learn(self, batch: TensorDictBase, position: BatchPosition) -> dict[str, float]:
+        return self.descend(self.prepare(batch, position), position, self.objective)
 
     @torch.no_grad()
-    def prepare(self, batch: TensorDictBase, at: At) -> TensorDictBase:
+    def prepare(self, batch: TensorDictBase, position: BatchPosition) -> TensorDictBase:
         """Return the frames ``[B]`` of a batch ``[N, T]``, with advantages and value targets."""
         following = batch["next"]
         following["reward"] = following["reward"] * self.task.reward_scale

@@ -11,27 +11,27 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from pickplace.common.graphs import PLAIN, Compile
+from pickplace.common.graphs import NO_COMPILE, CompileSettings
 from pickplace.common.validate import excerpt, refuse_any, refuse_if
 from pickplace.rules.observation import Term
 from pickplace.runs.checkpoint import matching_state
 from pickplace.runs.locate import CheckpointError
 
 
-class At(NamedTuple):
+class BatchPosition(NamedTuple):
     """The place of a batch in its run.
 
     Attributes:
-        before: frames of the run before the batch.
+        frames_before: frames of the run before the batch.
         frames: frames of the run, the batch included.
         iteration: number of the batch, from 1.
-        total: the run's budget in frames.
+        total_frames: the run's budget in frames.
     """
 
-    before: int
+    frames_before: int
     frames: int
     iteration: int
-    total: int
+    total_frames: int
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Task:
     reward_scale: float
     num_envs: int
     rollout_length: int
-    compile: Compile = PLAIN
+    compile: CompileSettings = NO_COMPILE
 
     @property
     def batch_frames(self) -> int:
@@ -81,7 +81,7 @@ class Algorithm(ABC):
         """
 
     @abstractmethod
-    def learn(self, batch: TensorDictBase, at: At) -> dict[str, float]:
+    def learn(self, batch: TensorDictBase, position: BatchPosition) -> dict[str, float]:
         """Learn from a batch ``[N, T]``; return metrics, named ``train/...``."""
 
     def state_dict(self) -> dict:
@@ -113,14 +113,14 @@ Objective = Callable[[TensorDictBase], tuple[Tensor, Mapping[str, Tensor]]]
 class Imitable(Protocol):
     """An algorithm whose policy can imitate a teacher before it learns from reward."""
 
-    def prepare(self, batch: TensorDictBase, at: At) -> TensorDictBase:
+    def prepare(self, batch: TensorDictBase, position: BatchPosition) -> TensorDictBase:
         """Return the frames ``[B]`` of a batch ``[N, T]`` with all that the loss reads. All random draws
         for the loss are made here."""
 
     def objective(self, data: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
         """Return the loss of a minibatch, and its parts; ``loss_critic`` is the critic's."""
 
-    def descend(self, data: TensorDictBase, at: At, objective: Objective) -> dict[str, float]:
+    def descend(self, data: TensorDictBase, position: BatchPosition, objective: Objective) -> dict[str, float]:
         """Minimise an objective on frames ``[B]``; return metrics."""
 
     def learning_memory(self, frame: int) -> dict[str, int]:

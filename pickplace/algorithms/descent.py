@@ -11,9 +11,9 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from pickplace.algorithms.base import Algorithm, At, Objective, Task, load_optimizer
-from pickplace.common.graphs import PLAIN, Work
-from pickplace.common.recording import is_recording
+from pickplace.algorithms.base import Algorithm, BatchPosition, Objective, Task, load_optimizer
+from pickplace.common.capture import is_capturing
+from pickplace.common.graphs import NO_COMPILE, Work
 from pickplace.common.validate import number, or_null, whole_number
 from pickplace.policies.base import Policy, as_collection_policy
 from pickplace.runs.checkpoint import matching_state
@@ -82,7 +82,7 @@ class MinibatchDescent(Algorithm):
         capturable = recorded and device.type == "cuda"
         self.optimizer = torch.optim.Adam(self.parameters, lr=rate, eps=1e-5, fused=True, capturable=capturable)
 
-    def descend(self, data: TensorDictBase, at: At, objective: Objective) -> dict[str, float]:
+    def descend(self, data: TensorDictBase, position: BatchPosition, objective: Objective) -> dict[str, float]:
         """Minimise an objective for ``epochs`` epochs of shuffled minibatches over frames ``[B]``.
 
         Returns:
@@ -92,9 +92,9 @@ class MinibatchDescent(Algorithm):
             FloatingPointError: if the loss or its gradient is not finite; with recorded steps after the batch, when the
                 weights are not finite either.
         """
-        rate = self.learning_rate(at)
-        if at.before == 0 and rate == 0 < self.lr:
-            log.warning("total_frames=%d: the only batch has learning rate 0; nothing is learnt", at.total)
+        rate = self.learning_rate(position)
+        if position.frames_before == 0 and rate == 0 < self.lr:
+            log.warning("total_frames=%d: the only batch has learning rate 0; nothing is learnt", position.total_frames)
         for group in self.optimizer.param_groups:
             if isinstance(group["lr"], Tensor):
                 group["lr"].fill_(rate)
@@ -113,7 +113,7 @@ class MinibatchDescent(Algorithm):
 
     def _compiled_step(self, objective: Objective) -> Callable[[TensorDictBase], dict[str, Tensor]]:
         """Return the function that makes a gradient step on a minibatch ``[B]`` for an objective."""
-        if self.task.compile == PLAIN:
+        if self.task.compile == NO_COMPILE:
             return partial(self._step, objective)
         if objective not in self._steps:
 
@@ -130,7 +130,7 @@ class MinibatchDescent(Algorithm):
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
         norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
-        if not is_recording() and not torch.isfinite(norm + total.detach()):
+        if not is_capturing() and not torch.isfinite(norm + total.detach()):
             self._refuse_infinite(losses, part)
         self.optimizer.step()
         diagnostics = {name: losses[key].detach() for key, name in DIAGNOSTICS.items() if key in losses}
@@ -142,21 +142,29 @@ class MinibatchDescent(Algorithm):
         ranges = "; ".join(f"{key} {value_range(value)}" for key, value in values if value.is_floating_point())
         raise FloatingPointError(f"the loss or its gradient is not finite: {ranges}; expected a smaller algo.lr.")
 
-    def learning_rate(self, at: At) -> float:
+    def learning_rate(self, position: BatchPosition) -> float:
         """Return the learning rate of a batch; if it falls, a new run's last batch has 0."""
-        falls = "" if self.lr_decay_start is None else f" lr_decay_start={self.lr_decay_start} total_frames={at.total}"
+        falls = (
+            ""
+            if self.lr_decay_start is None
+            else f" lr_decay_start={self.lr_decay_start} total_frames={position.total_frames}"
+        )
         before, now = self.schedule["settings"], f"lr={self.lr}{falls}"
         if before != now:
-            self.schedule = {"settings": now, "since": at.before if before else 0}
+            self.schedule = {"settings": now, "since": position.frames_before if before else 0}
         if before and before != now:
-            start = at.before + (self.lr_decay_start or 0) * (at.total - at.before)
-            until = f", and falls to 0 from {start:,.0f} to {at.total:,} frames" * bool(falls)
-            log.info("%s frames: the learning rate is now %g%s", f"{at.before:,}", self.lr, until)
+            start = position.frames_before + (self.lr_decay_start or 0) * (
+                position.total_frames - position.frames_before
+            )
+            until = f", and falls to 0 from {start:,.0f} to {position.total_frames:,} frames" * bool(falls)
+            log.info("%s frames: the learning rate is now %g%s", f"{position.frames_before:,}", self.lr, until)
         if self.lr_decay_start is None:
             return self.lr
         since = self.schedule["since"]
-        frames = at.before if since else at.frames  # a run resumed with a new schedule learns in its last batch, too
-        left = (1 - (frames - since) / max(at.total - since, 1)) / max(1 - self.lr_decay_start, 1e-9)
+        frames = (
+            position.frames_before if since else position.frames
+        )  # a run resumed with a new schedule learns in its last batch, too
+        left = (1 - (frames - since) / max(position.total_frames - since, 1)) / max(1 - self.lr_decay_start, 1e-9)
         return self.lr * min(max(left, 0.0), 1.0)
 
     def state_dict(self) -> dict:

@@ -9,8 +9,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from pickplace.algorithms.base import Algorithm, At, Imitable
-from pickplace.common.validate import expect, reworded
+from pickplace.algorithms.base import Algorithm, BatchPosition, Imitable
+from pickplace.common.validate import expect, reword_errors
 from pickplace.config.allowlist import trusted_config
 from pickplace.config.registry import accepted_arguments, build, find
 from pickplace.envs.torchrl import PickPlaceEnv
@@ -22,7 +22,7 @@ from pickplace.runs import checkpoint
 from pickplace.runs.locate import locate
 
 #: Puts the keys of ``warm_start`` into errors of planners, which begin with ``planner`` or ``checkpoint``.
-_named_keys = reworded(
+_named_keys = reword_errors(
     ValueError,
     lambda error: ValueError(
         re.sub(r"^planner\b", "warm_start.teacher", re.sub(r"^checkpoint\b", "warm_start.checkpoint", str(error)))
@@ -117,14 +117,14 @@ class Imitation(Algorithm):
     def acting_policy(self) -> TensorDictModuleBase:
         return self.inner.acting_policy()
 
-    def learn(self, batch: TensorDictBase, at: At) -> dict[str, float]:
+    def learn(self, batch: TensorDictBase, position: BatchPosition) -> dict[str, float]:
         start = self.warm_start
-        if at.before >= start.frames + start.critic_frames:
-            return self.inner.learn(batch, at)
-        data = self.inner.prepare(batch, at)
-        if at.before < start.frames:
-            data["taught"] = start.ask(batch.reshape(-1), at.iteration)
-        return self.inner.descend(data, at, self.objective)
+        if position.frames_before >= start.frames + start.critic_frames:
+            return self.inner.learn(batch, position)
+        data = self.inner.prepare(batch, position)
+        if position.frames_before < start.frames:
+            data["taught"] = start.ask(batch.reshape(-1), position.iteration)
+        return self.inner.descend(data, position, self.objective)
 
     def objective(self, data: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
         """Return the critic's loss, plus the imitation loss if there is an entry ``data["taught"]``."""

@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from pickplace.algorithms.base import At
+from pickplace.algorithms.base import BatchPosition
 from pickplace.algorithms.ppo import PPO, ClippedLoss
 from pickplace.algorithms.sampled_softmax import CANDIDATE_KEYS, as_sampled_actor, as_sampling_policy
 from pickplace.common.validate import expect, number, one_of, whole_number
@@ -55,13 +55,13 @@ class SampledPPO(PPO):
     def acting_policy(self) -> TensorDictModuleBase:
         return as_sampling_policy(self.policy, self.samples, self.temperature)
 
-    def prepare(self, batch: TensorDictBase, at: At) -> TensorDictBase:
+    def prepare(self, batch: TensorDictBase, position: BatchPosition) -> TensorDictBase:
         """Return the frames ``[B]`` of a batch ``[N, T]``, with advantages ``[B, 1 + samples, 1]``."""
-        data = super().prepare(batch, at)
+        data = super().prepare(batch, position)
         if self.advantages == "vine":
             return data.set("advantage", self.vine_advantages(batch.reshape(-1)))
         count = data[CANDIDATE_KEYS[0]].shape[1]
-        return data.set("advantage", of_taken_choice(data["advantage"], count, self.normalize_advantage))
+        return data.set("advantage", taken_choice_advantages(data["advantage"], count, self.normalize_advantage))
 
     def objective(self, data: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
         total, losses = super().objective(data)
@@ -119,7 +119,7 @@ class SampledPPO(PPO):
         return value.view(candidates.shape)
 
 
-def of_taken_choice(advantage: Tensor, candidates: int, normalize: bool) -> Tensor:
+def taken_choice_advantages(advantage: Tensor, candidates: int, normalize: bool) -> Tensor:
     """Return advantages ``[B, candidates, 1]`` that are zero except for the taken choice, which is the first.
 
     They are scaled so that the mean over candidates equals the loss of the taken choice.

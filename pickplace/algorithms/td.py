@@ -6,7 +6,7 @@ from torch import Tensor
 from torchrl.modules import ValueOperator
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-from pickplace.algorithms.base import At, Task
+from pickplace.algorithms.base import BatchPosition, Task
 from pickplace.algorithms.descent import MinibatchDescent
 from pickplace.common.validate import expect, number, whole_number
 from pickplace.policies.afterstate.value import ToteValue
@@ -40,9 +40,9 @@ class TD(MinibatchDescent):
         self.gamma, self.lmbda = number("algo.gamma", gamma, most=1), number("algo.lmbda", lmbda, most=1)
         self.use_parameters(self.network.parameters())
 
-    def learn(self, batch: TensorDictBase, at: At) -> dict[str, float]:
+    def learn(self, batch: TensorDictBase, position: BatchPosition) -> dict[str, float]:
         after = totes_left(batch, self.policy)
-        return self.descend(with_targets(after, self.network, self.gamma, self.lmbda), at, self.objective)
+        return self.descend(with_targets(after, self.network, self.gamma, self.lmbda), position, self.objective)
 
     def objective(self, data: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the mean of the squared errors of the values and of their parts; and diagnostics, such as the share of

@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from pickplace.common.validate import excerpt, reworded, short_text
+from pickplace.common.validate import excerpt, reword_errors, short_text
 
 
 class WorkerDied(Exception):
@@ -120,9 +120,9 @@ def _sentence(error: Exception) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())} (HYDRA_FULL_ERROR=1 shows where)"
 
 
-def needs_extra(group: str, extra: str) -> AbstractContextManager:
+def require_extra(group: str, extra: str) -> AbstractContextManager:
     """Raise an error that names the optional extra of a config group's option, if an import in the block fails."""
-    return reworded(
+    return reword_errors(
         ImportError, lambda _: ValueError(f"{group}={extra}: {extra} is missing; pip install 'pickplace[{extra}]'.")
     )
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from pickplace.common.validate import at_most, excerpt, refuse_if, reworded
+from pickplace.common.validate import excerpt, refuse_above, refuse_if, reword_errors
 
 #: Greatest size of a file that is read, in bytes, unless a reader sets its own: more would fill the memory.
 MAX_BYTES = 2**30
@@ -34,7 +34,7 @@ def read_file(path, most: int = MAX_BYTES, links: bool = True, empty: bool = Tru
     path = Path(path)
     found = path.stat(follow_symlinks=links)
     refuse_if(not stat.S_ISREG(found.st_mode), f"{path}: a folder, link, pipe or device; expected a regular file.")
-    at_most(f"{path}:", found.st_size, "bytes", most)
+    refuse_above(f"{path}:", found.st_size, "bytes", most)
     refuse_if(not (found.st_size or empty), f"{path}: 0 bytes; expected a file with content.")
     with path.open("rb") as file:
         return file.read(found.st_size)
@@ -42,7 +42,7 @@ def read_file(path, most: int = MAX_BYTES, links: bool = True, empty: bool = Tru
 
 def read_text(path, most: int = MAX_BYTES, encoding: str = "utf-8", empty: bool = True) -> str:
     """Return the text of a regular file; for arguments and errors see :func:`read_file`."""
-    with reworded(
+    with reword_errors(
         UnicodeDecodeError, lambda error: ValueError(f"{path}, {_bad_byte(error)}; expected a text in UTF-8.")
     ):
         return read_file(path, most, empty=empty).decode(encoding)
@@ -70,7 +70,7 @@ def csv_rows(path, text: str, separator: str = ",") -> Iterator[tuple[int, list[
     def refusal(error: csv.Error) -> ValueError:
         return ValueError(f"{path}, line {line}: {error}; expected a CSV in UTF-8, each quote closed in its field.")
 
-    with reworded(csv.Error, refusal):
+    with reword_errors(csv.Error, refusal):
         for row in reader:
             yield line, [field.strip() for field in row]
             line = reader.line_num + 1
@@ -114,7 +114,7 @@ def replaced_file(path):
     """
     path = Path(path)
     new = path.with_name(f".{path.stem}.new{path.suffix}")
-    with reworded(OSError, lambda error: OSError(error.errno, error.strerror or str(error), str(path))):
+    with reword_errors(OSError, lambda error: OSError(error.errno, error.strerror or str(error), str(path))):
         try:
             new.unlink(missing_ok=True)  # it may be a link
             yield new

@@ -15,7 +15,7 @@ from tensordict.nn import CudaGraphModule
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from pickplace.common.recording import recording
+from pickplace.common.capture import capturing
 from pickplace.common.validate import flag, one_of, or_null, refuse_if
 
 #: A function of tensors by name. All tensors of a recorded one are detached; its shapes are fixed.
@@ -26,7 +26,7 @@ MODES = ("default", "max-autotune-no-cudagraphs")
 
 
 @dataclass(frozen=True)
-class Compile:
+class CompileSettings:
     """How the work of a training is compiled; the names are those of TorchRL's own trainings.
 
     Args:
@@ -54,13 +54,13 @@ class Compile:
 
     def steps(self, work: Work, what: str) -> Work:
         """Return the compiled form of work of many small steps, which ``torch.compile`` would take minutes to read."""
-        return Recorded(work, what) if self.cudagraphs else work
+        return CapturedWork(work, what) if self.cudagraphs else work
 
 
-PLAIN = Compile()
+NO_COMPILE = CompileSettings()
 
 
-class Recorded:
+class CapturedWork:
     """Work that a GPU records in its third call, and then repeats; calls with other shapes run as they are.
 
     The first call makes constants, and the second one checks the work. On a CPU all calls run as they are.
@@ -82,14 +82,14 @@ class Recorded:
         kinds = {key: (value.shape, value.dtype) for key, value in inputs.items()}
         if not self.kinds:
             self.kinds, self.graph = kinds, self._make_graph(next(iter(inputs.values())).device)
-        with recording():
+        with capturing():
             if kinds != self.kinds:
                 return self.work(inputs)
             self.calls += 1
             ordered = {key: inputs[key] for key in self.kinds}  # the graph's inputs have places, not names
             if self.calls != 2:
                 return self.graph(ordered)
-            with ReadsBack() as found:
+            with CaptureChecker() as found:
                 result = self.graph(ordered)
         places = "; ".join(dict.fromkeys(found.places))
         message = f"{self.what} looks at results while it runs ({places}); expected compile=none."
@@ -106,7 +106,7 @@ class Recorded:
         return CudaGraphModule(lambda inputs: self.work({**inputs}), warmup=3)
 
 
-class ReadsBack(TorchDispatchMode):
+class CaptureChecker(TorchDispatchMode):
     """Finds operations that a CUDA graph cannot hold: those that read results back, or whose shapes depend on data.
 
     On a CPU, ``tolist`` and ``numpy`` are not seen; a GPU copies for them, which is.

@@ -8,14 +8,14 @@ from types import ModuleType
 
 def import_quietly(name: str) -> ModuleType:
     """Import a module; Ctrl-C meanwhile ends the process without a message."""
-    before = on_interrupt(end_process)
+    before = set_interrupt_handler(end_process)
     try:
         return import_module(name)
     finally:
-        on_interrupt(before)
+        set_interrupt_handler(before)
 
 
-def on_interrupt(handler):
+def set_interrupt_handler(handler):
     """Set the handler of Ctrl-C, unless it is ignored, and return the earlier one."""
     if (before := signal.getsignal(signal.SIGINT)) != signal.SIG_IGN:
         signal.signal(signal.SIGINT, handler)

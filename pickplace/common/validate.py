@@ -65,7 +65,7 @@ def refuse_any(found: Iterable, message: Callable[[Any], str], error: type[Excep
         raise error(message(first))
 
 
-def without_twins(pairs: list[tuple[str, Any]]) -> dict:
+def unique_keys(pairs: list[tuple[str, Any]]) -> dict:
     """Return an object of a JSON text; refuse a repeated key, as readers differ in which value counts."""
     found: dict = {}
     for key, value in pairs:
@@ -75,7 +75,7 @@ def without_twins(pairs: list[tuple[str, Any]]) -> dict:
 
 
 @contextmanager
-def reworded(errors, new: Callable[[Any], Exception]) -> Iterator[None]:
+def reword_errors(errors, new: Callable[[Any], Exception]) -> Iterator[None]:
     """Raise ``new(error)`` instead of an error of these types in the block."""
     try:
         yield
@@ -83,7 +83,7 @@ def reworded(errors, new: Callable[[Any], Exception]) -> Iterator[None]:
         raise new(error) from error
 
 
-def at_most(words: str, count: int, what: str, most: int) -> None:
+def refuse_above(words: str, count: int, what: str, most: int) -> None:
     """Refuse a count that is too great; the message begins with ``words``."""
     refuse_if(count > most, f"{words} {count:,} {what}; expected at most {most:,}.")
 
@@ -174,7 +174,7 @@ def or_null(check: Callable[..., Any], key: str, value, *limits) -> Any:
 
 def check_inputs(key: str, count: int) -> None:
     """Refuse a layer with more inputs than :data:`MAX_INPUTS`."""
-    at_most(f"{key}: a neuron would have", count, "inputs", MAX_INPUTS)
+    refuse_above(f"{key}: a neuron would have", count, "inputs", MAX_INPUTS)
 
 
 def check_bytes(setting: str, needed: int, device="cpu") -> None:
@@ -191,7 +191,7 @@ def check_bytes(setting: str, needed: int, device="cpu") -> None:
 
     device, given = torch.device(device), os.environ.get(MEMORY_VARIABLE)
     most = torch.cuda.get_device_properties(device).total_memory / 2e9 if device.type == "cuda" else CPU_GIGABYTES
-    with reworded(
+    with reword_errors(
         ValueError, lambda _: ValueError(f"{MEMORY_VARIABLE}={excerpt(given)}: expected a number of gigabytes.")
     ):
         most = most if given is None else number(MEMORY_VARIABLE, float(given))

@@ -15,7 +15,7 @@ from typing import Any
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from pickplace.common.validate import at_most, excerpt, expect, first_line, refuse_any, reworded, short_text
+from pickplace.common.validate import excerpt, expect, first_line, refuse_above, refuse_any, reword_errors, short_text
 from pickplace.config.registry import names_at, qualified_names
 
 #: Modules that are never a user's own: with their functions a config could do anything.
@@ -51,7 +51,7 @@ def trusted_config(content: dict, trust=(), groups: Collection[str] | None = POL
     own, groups = own_modules(trust), tuple(content) if groups is None else groups
     refuse_large_config({key: content[key] for key in groups if key in content})
     content = select_groups(content, groups)
-    with reworded(
+    with reword_errors(
         (OmegaConfBaseException, RecursionError, AttributeError, TypeError),
         lambda error: ValueError(f"The checkpoint's config cannot be read ({first_line(error)})."),
     ):
@@ -70,9 +70,9 @@ def refuse_large_config(content) -> None:
     """Refuse a config that would fill the memory, before OmegaConf makes an object of each of its nodes."""
     for count, (path, value) in enumerate(walk(content), start=1):
         longest = max((len(part) for part in (*path[-1:], value) if isinstance(part, str)), default=0)
-        at_most("The checkpoint's config has", count, "entries or more", MAX_NODES)
-        at_most("The checkpoint's config has", len(path) + 1, "levels or more", MAX_DEPTH)
-        at_most("The checkpoint's config has", longest, "characters in a text or more", MAX_TEXT)
+        refuse_above("The checkpoint's config has", count, "entries or more", MAX_NODES)
+        refuse_above("The checkpoint's config has", len(path) + 1, "levels or more", MAX_DEPTH)
+        refuse_above("The checkpoint's config has", longest, "characters in a text or more", MAX_TEXT)
 
 
 def own_modules(trust) -> tuple[str, ...]:
@@ -130,7 +130,7 @@ def _is_defined_by(target, trust: Collection[str]) -> bool:
     """Return whether a trusted module, or a part of it, defines that class or function, and not merely imports it."""
     if (module := _module(target)) not in trust or not re.fullmatch(r"[A-Za-z]\w*", target[len(module) + 1 :]):
         return False
-    with reworded(
+    with reword_errors(
         ImportError,
         lambda error: ValueError(f"trust={module}: it cannot be imported ({error}); expected it on PYTHONPATH."),
     ):

@@ -20,7 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from pickplace.common.errors import Parser, full_names, one_sentence, sentence, write_output
 from pickplace.common.interrupts import import_quietly
-from pickplace.common.validate import refuse_any, refuse_if, reworded
+from pickplace.common.validate import refuse_any, refuse_if, reword_errors
 from pickplace.config import composition
 from pickplace.config.help import help_text
 
@@ -111,7 +111,7 @@ class Command:
 
     def _start(self, words: list[str], flags: list[str], app: Callable[[DictConfig], Any] = lambda cfg: None) -> None:
         sys.argv[1:] = [*words, *flags]
-        with reworded(HydraException, lambda error: composition.clearer_error(error, self.config_name, words)):
+        with reword_errors(HydraException, lambda error: composition.clearer_error(error, self.config_name, words)):
             hydra.main(version_base="1.3", config_path=str(composition.conf_dir()), config_name=self.config_name)(app)()
 
     def _run(self, merged: DictConfig, checked: DictConfig | None, words: list[str], flags: list[str]) -> None:

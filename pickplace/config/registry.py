@@ -59,7 +59,7 @@ REGISTRY: dict[str, dict[str, str]] = {
         individual_grasp="individual.policy.individual_grasp",
     ),
     "model.critic": _classes("policies.critics", pooled="Pooled", conv4d="Conv4d"),
-    "compile": _classes("common.graphs", compile="Compile"),
+    "compile": _classes("common.graphs", compile="CompileSettings"),
     "curriculum": _classes("training.curriculum.curriculum", curriculum="Curriculum"),
     "curriculum.advance": _classes(
         "training.curriculum", none="advance.NoAdvance", frames="advance.Frames", threshold="advance.Threshold",

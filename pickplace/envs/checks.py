@@ -7,8 +7,8 @@ from itertools import product
 import numpy as np
 import torch
 
-from pickplace.common.recording import is_recording
-from pickplace.common.validate import at_most
+from pickplace.common.capture import is_capturing
+from pickplace.common.validate import refuse_above
 from pickplace.items.distributions import ItemDistribution
 from pickplace.items.tipping import longest_side
 from pickplace.rules.cell import CellSpec
@@ -69,7 +69,7 @@ def check_items(cell: CellSpec, items: ItemDistribution, mix: int = 0, turns: in
     if largest := cell.gripper.largest_item:
         widest["gripper.size" if largest == cell.gripper.size else "the cup"] = largest
     sizes_of_kinds = items.sizes.tolist()
-    for kind in items.arrives(mix).nonzero()[:, 0].tolist():
+    for kind in items.arrival_mask(mix).nonzero()[:, 0].tolist():
         w, d, h = sizes_of_kinds[kind]
         for what, (grid_w, grid_d) in widest.items():
             if w > grid_w or d > grid_d:
@@ -82,7 +82,7 @@ def check_items(cell: CellSpec, items: ItemDistribution, mix: int = 0, turns: in
                 raise ValueError(f"{items.label(kind)} at x={x}, y={y} leaves the bin: expected it inside {w_b}x{d_b}.")
             problems.setdefault((x, y, w, d, h, allowed), kind)
         words = f"bin_size={[*cell.bin_size]}: the kinds of items have at least"
-        at_most(words, len(problems), "positions in the bin", MAX_POSITIONS)
+        refuse_above(words, len(problems), "positions in the bin", MAX_POSITIONS)
     description = f"{cell.describe()}, support={cell.support}" + (f", reach={cell.reach}" if cell.reach else "")
     cell = replace(cell, longest_side=longest_side(cell, items))
     rows = torch.tensor([(*item, kind) for item, kind in problems.items()])
@@ -123,12 +123,12 @@ def check_numbers(key: str, values: torch.Tensor, low: int, high: int, expected:
 
 
 def require(good: torch.Tensor, message: Callable[[torch.Tensor], str]) -> None:
-    """Raise a ``ValueError`` unless all of ``good``, bool, is true; in a recording the device stops the program later.
+    """Raise a ``ValueError`` unless all of ``good``, bool, is true; in a capture the device stops the program later.
 
     Args:
         message: returns the error's text, given where ``good`` is false.
     """
-    if is_recording():
+    if is_capturing():
         torch._assert_async(good.all())
     elif not good.all():
         raise ValueError(message(~good))

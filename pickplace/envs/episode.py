@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from pickplace.common.validate import expect, integral_number, is_whole, one_of, reworded
+from pickplace.common.validate import expect, integral_number, is_whole, one_of, reword_errors
 from pickplace.items.distributions import ItemDistribution
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import flags_from_turns, turns_from_flags
@@ -22,7 +22,7 @@ class Setting(NamedTuple):
     """One setting.
 
     Attributes:
-        field: its name in an :class:`~pickplace.rules.state.Episode`.
+        field: its name in an :class:`~pickplace.rules.state.EpisodeSettings`.
         full: ``full(cell)``, its number in the full task.
         limits: ``limits(cell, items)``, the least and the greatest number.
         read: ``read(key, value, cell)``, the number that stands for a value in a config; ``ValueError`` for a bad one.
@@ -54,7 +54,7 @@ def _read_up_to(most: Callable[[CellSpec], int], origin: str, least: int = 1) ->
     """Return a function that reads a whole number from ``least`` to a limit of the cell."""
 
     def read(key: str, value: Any, cell: CellSpec) -> int:
-        with reworded(ValueError, lambda error: ValueError(f"{str(error).rstrip('.')}, {origin}.")):
+        with reword_errors(ValueError, lambda error: ValueError(f"{str(error).rstrip('.')}, {origin}.")):
             return integral_number(key, value, least, most(cell))
 
     return read

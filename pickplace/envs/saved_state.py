@@ -10,12 +10,12 @@ from pickplace.envs.episode import RESET_ENTRIES, SETTINGS
 from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.items.arrival import coming_items, next_item
 from pickplace.items.distributions import MAX_SEED
-from pickplace.items.tipping import in_pose, sizes_in_bin
+from pickplace.items.tipping import sizes_in_bin, tipped_items
 from pickplace.rules.bin import select_item
 from pickplace.rules.item import NO_LIMIT, Item, bin_labels_from_items
 from pickplace.rules.observation import observe, standard_terms
 from pickplace.rules.pile import Pile
-from pickplace.rules.state import Episode, State
+from pickplace.rules.state import EpisodeSettings, State
 from pickplace.runs.locate import CheckpointError
 
 
@@ -57,7 +57,7 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
     for key, (low, high) in env.limits.items():
         value = saved[RESET_ENTRIES[key].field]
         check(key, (value >= low) & (value <= high), f"{low} to {high}")
-    episode = Episode(**{SETTINGS[key].field: saved[SETTINGS[key].field] for key in cell.varies})
+    episode = EpisodeSettings(**{SETTINGS[key].field: saved[SETTINGS[key].field] for key in cell.varies})
     pile = Pile(*(saved[key] for key in Pile._fields)) if cell.handling else None
     coming = Item.from_table(saved["coming"]) if cell.preview else None
     state = State(surface, tote_height, Item.from_table(saved["item"]), episode, pile, coming)
@@ -81,7 +81,7 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
     check("arrived", saved["arrived"] == steps + count // cell.poses, "the items placed and those in the bin")
     newest = select_item(items, (count - 1).clamp(min=0)).table
     address = seed.expand_as(number), number, saved["arrived"] - 1
-    arrival = in_pose(cell, env.items, next_item(cell, env.items, env.stream, *address, episode), cell.poses - 1)
+    arrival = tipped_items(cell, env.items, next_item(cell, env.items, env.stream, *address, episode), cell.poses - 1)
     same = (newest == arrival.table)[:, 2:].all(1)  # wherever it lies
     check("item", same | (count < cell.bin_items), "the newest item of this episode")  # it may have been taken
     if coming is not None:

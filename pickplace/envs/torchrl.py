@@ -9,8 +9,8 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from pickplace.common.capture import any_of, is_capturing
 from pickplace.common.machine import usable_device
-from pickplace.common.recording import any_of, is_recording
 from pickplace.common.validate import check_bytes, expect, one_of, or_null, refuse_if, whole_number
 from pickplace.envs.checks import check_items, check_numbers, most_items, problem_bytes, require
 from pickplace.envs.episode import RESET_ENTRIES, SETTINGS
@@ -23,7 +23,7 @@ from pickplace.rules.cell import CELL_SETTINGS, cell_from_settings
 from pickplace.rules.item import ALL_TURNS, Item
 from pickplace.rules.observation import Term, check_terms, observe
 from pickplace.rules.pile import Pile
-from pickplace.rules.state import EMPTY, Episode, Failure, State
+from pickplace.rules.state import EMPTY, EpisodeSettings, Failure, State
 from pickplace.rules.step import apply
 
 DONE_KEYS = ("done", "terminated", "truncated")
@@ -262,7 +262,7 @@ class PickPlaceEnv(EnvBase):
                 "tallest item."
             ),
         )
-        if self.cell.varies and not is_recording():
+        if self.cell.varies and not is_capturing():
             turns = found.get("turns", torch.full_like(height, ALL_TURNS))
             for pair in {*zip(mix[rows].tolist(), turns[rows].tolist(), strict=True)} - self._checked_starts:
                 check_items(self.cell, self.items, *pair)
@@ -316,8 +316,10 @@ class PickPlaceEnv(EnvBase):
         return Pile(*map(self.get_buffer, Pile._fields)) if self.cell.handling else None
 
     @property
-    def _episode_settings(self) -> Episode:
-        return Episode(**{SETTINGS[key].field: self.get_buffer(SETTINGS[key].field) for key in self.cell.varies})
+    def _episode_settings(self) -> EpisodeSettings:
+        return EpisodeSettings(
+            **{SETTINGS[key].field: self.get_buffer(SETTINGS[key].field) for key in self.cell.varies}
+        )
 
     @property
     def exact_occupancy(self) -> Tensor:
@@ -349,7 +351,7 @@ class PickPlaceEnv(EnvBase):
         Args:
             empty: the totes of these problems are empty.
         """
-        if is_recording():  # all rows, always, into the same tensors
+        if is_capturing():  # all rows, always, into the same tensors
             masks = self._make_masks.of(self.state)
             for name, old in [(name, self.get_buffer(f"{name}_mask")) for name in self.masks]:
                 old.copy_(torch.where(rows[:, None], masks[name], old))
@@ -373,8 +375,8 @@ class PickPlaceEnv(EnvBase):
         observation["occupancy"] = self.exact_occupancy.float()[:, None]
         observation["failure"] = torch.zeros_like(self.tote_height)[:, None]
         for name in self.masks:
-            mask = getattr(self, f"{name}_mask")  # never written to again, except in a recording, see `_update_masks`
-            observation[f"{name}_mask"] = mask.clone() if is_recording() else mask
+            mask = getattr(self, f"{name}_mask")  # never written to again, except in a capture, see `_update_masks`
+            observation[f"{name}_mask"] = mask.clone() if is_capturing() else mask
         return TensorDict(observation, batch_size=self.batch_size, device=self.device)
 
 

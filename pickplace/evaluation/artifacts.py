@@ -8,7 +8,7 @@ from typing import Any
 
 from pickplace.common.errors import sentence
 from pickplace.common.files import replaced_file
-from pickplace.common.validate import flag, reworded, whole_number
+from pickplace.common.validate import flag, reword_errors, whole_number
 from pickplace.physics.plans import PLANS, EpisodePlan, to_lines
 from pickplace.rules.cell import POSES, CellSpec
 from pickplace.runs.folder import EVALUATION
@@ -55,7 +55,7 @@ class Artifacts:
             texts["replay.html"] = page(recordings[: self.replay], cell, title)
         if self.plans:
             texts[PLANS] = to_lines(plans)
-        with reworded(
+        with reword_errors(
             OSError,
             lambda error: ValueError(f"{sentence(error)} The table above and the files that are there are whole."),
         ):

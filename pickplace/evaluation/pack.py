@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import refuse_if, reworded, whole_number
+from pickplace.common.validate import refuse_if, reword_errors, whole_number
 from pickplace.config.registry import find, names_at
 from pickplace.items.order_file import ORIENTATIONS, TURNS, OrderItem
 from pickplace.planners.base import MapPlanner
@@ -30,7 +30,7 @@ Faces: TypeAlias = Sequence[tuple[str, str]]  # the orientations of each face, a
 Variant: TypeAlias = tuple[tuple[str, str], list[int]]  # an item on one of its faces, as a row of a table of items
 
 MAX_CELL = 1_000  # side of a cell, mm: heights are in mm, and a cell has at most 1,000 height units
-LEAST_MARGIN = 10.0  # of an item's centre from the edge of its support, mm
+MIN_MARGIN = 10.0  # of an item's centre from the edge of its support, mm
 CELL_MARGIN = 20.0  # the same for the cells that it takes, mm; large, as piles are high
 
 #: Orientations of an item on each face on which it may lie, as it lies and turned by 90 degrees; first the upright one.
@@ -94,7 +94,7 @@ class OrderPacker:
 
     Within its cells, an item lies in the corner with the least x and y. Items that carry another one together
     are level within a millimetre. By the items' true sides, all four corners of an item lie in the hull of its support,
-    or its centre does, :data:`LEAST_MARGIN` from the edge; only what lies in the hull of its own support carries
+    or its centre does, :data:`MIN_MARGIN` from the edge; only what lies in the hull of its own support carries
     others, down to the floor. Nothing sticks out of the container, or passes its rim. An item is turned only as it
     allows, and no item carries more than it bears: the full mass of an item counts on each one below it in the pile.
 
@@ -214,8 +214,8 @@ class OrderPacker:
         wide, deep, high = (max(part) for part in zip(*sides, strict=True))
         length, width = (side // self.cell_mm for side in self.container[:2])
         bins = (len(self._faces) * wide, deep, high)  # an item on each of its faces, side by side
-        with reworded(ValueError, lambda error: ValueError(f"cell={self.cell_mm} mm is too fine: {error}")):
-            support = RoundedUp(max(CELL_MARGIN, LEAST_MARGIN + lost) / self.cell_mm)
+        with reword_errors(ValueError, lambda error: ValueError(f"cell={self.cell_mm} mm is too fine: {error}")):
+            support = RoundedUp(max(CELL_MARGIN, MIN_MARGIN + lost) / self.cell_mm)
             cell = PackingCell(
                 support=support, bin_size=bins, tote_size=(length, width, self.container[2]), **self._settings
             )

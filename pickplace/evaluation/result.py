@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from pickplace.common.files import read_file
-from pickplace.common.validate import excerpt, is_name, is_number, refuse_if, reworded
+from pickplace.common.validate import excerpt, is_name, is_number, refuse_if, reword_errors
 from pickplace.config.allowlist import refuse_foreign_targets
 from pickplace.config.registry import build, node_of, with_defaults
 from pickplace.evaluation.play import Episodes
@@ -168,7 +168,7 @@ def read_comparison(path: Path, expected: dict, trust: Collection[str] = ()) -> 
         ValueError: for a file that cannot be read, or that is about other episodes.
     """
     refused = f"compare={excerpt(str(path))}: expected an evaluation.json"
-    with reworded(
+    with reword_errors(
         (OSError, ValueError, KeyError, TypeError, RecursionError), lambda error: ValueError(f"{refused} ({error}).")
     ):
         other = json.loads(read_file(path, MAX_EVALUATION, empty=False))
@@ -182,7 +182,7 @@ def read_comparison(path: Path, expected: dict, trust: Collection[str] = ()) -> 
             f"compare={excerpt(str(path))}: its {key} is {excerpt(theirs)}, expected {excerpt(ours)}.",
         )
     cell = build_cell(expected["env"], reach=None)
-    with reworded(ValueError, lambda error: ValueError(f"{refused} ({error})")):
+    with reword_errors(ValueError, lambda error: ValueError(f"{refused} ({error})")):
         refuse_foreign_targets(env, trust, "env")
         other_cell = build_cell(env, reach=None)  # what is missing has its default
     reaches = ("env.reach", expected["env"].get("reach"), env.get("reach"))

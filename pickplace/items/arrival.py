@@ -3,18 +3,18 @@
 import torch
 from torch import Tensor
 
-from pickplace.common.recording import any_of
+from pickplace.common.capture import any_of
 from pickplace.items.distributions import ItemDistribution, hashed_uniform
-from pickplace.items.tipping import in_pose
-from pickplace.rules.bin import add_item, find_room, is_below_limit, must_share
+from pickplace.items.tipping import tipped_items
+from pickplace.rules.bin import add_item, find_room, has_occupied_bins, is_below_limit
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Item
-from pickplace.rules.state import FULL_TASK, Episode
+from pickplace.rules.state import FULL_TASK, EpisodeSettings
 
 
 def refill(
     cell: CellSpec, source: ItemDistribution, stream: str, seed: Tensor, episode: Tensor, arrived: Tensor, items: Item,
-    rows: Tensor, settings: Episode = FULL_TASK,
+    rows: Tensor, settings: EpisodeSettings = FULL_TASK,
 ) -> tuple[Item, Tensor]:  # fmt: skip
     """Return the bins after new items arrived, ``[N, M]``, and the number that has arrived in all, int64 ``[N]``.
 
@@ -38,8 +38,8 @@ def refill(
             break
         item, before = next_item(cell, source, stream, seed, episode, arrived, settings), items
         for pose in range(cell.poses):
-            posed = in_pose(cell, source, item, pose)
-            if must_share(items, open_):
+            posed = tipped_items(cell, source, item, pose)
+            if has_occupied_bins(items, open_):
                 # It selects one of the free places at random, or with poses the first.
                 share = hashed_uniform(stream, seed, episode, arrived, 4)[3] * (not cell.tipping)
                 keeps_place = ~items.exists[:, 0] | (source.has_corners and not cell.tipping)
@@ -54,7 +54,7 @@ def refill(
 
 def next_item(
     cell: CellSpec, source: ItemDistribution, stream: str, seed: Tensor, episode: Tensor, arrived: Tensor,
-    settings: Episode,
+    settings: EpisodeSettings,
 ) -> Item:  # fmt: skip
     """Return the item that arrives next in each episode, ``[N]``, at its own place; arguments: see :func:`refill`."""
     item = source.sample(stream, seed, episode, arrived, cell.bin_size, **source.mix_arguments(settings.item_mix))
@@ -63,7 +63,7 @@ def next_item(
 
 def coming_items(
     cell: CellSpec, source: ItemDistribution, stream: str, seed: Tensor, episode: Tensor, arrived: Tensor,
-    settings: Episode = FULL_TASK,
+    settings: EpisodeSettings = FULL_TASK,
 ) -> Item:  # fmt: skip
     """Return the items of the preview, in their order, ``[N, p]``; arguments: see :func:`refill`.
 

@@ -6,9 +6,9 @@ from itertools import product
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import at_most, one_of, size_tuple
+from pickplace.common.validate import one_of, refuse_above, size_tuple
 from pickplace.items.distributions import MAX_KINDS, ItemDistribution, check_range, hashed_uniform, place_at_random
-from pickplace.items.kept import KeptEpisodes
+from pickplace.items.kept import EpisodeCache
 
 #: Orders of arrival: CUT-1 and CUT-2.
 ORDERS = ("z", "stacking")
@@ -58,7 +58,7 @@ class Cut(ItemDistribution):
         if bad := [side for side in self.container if not fits[side]]:
             raise ValueError(f"{key}: sides of {least} to {greatest} do not add up to {bad[0]}; expected some that do.")
         count = math.prod(side // least for side in self.container)
-        at_most(f"{key}: an episode has up to", count, "items", MAX_ITEMS)
+        refuse_above(f"{key}: an episode has up to", count, "items", MAX_ITEMS)
         self.longest_episode = count
         cuts = [
             [at for at in range(least, length - least + 1) if length > greatest and fits[at] and fits[length - at]]
@@ -68,19 +68,19 @@ class Cut(ItemDistribution):
         for length, places in enumerate(cuts):
             arising.append({length} if length <= greatest else set().union(*(arising[at] for at in places)))
         sides_of_items = [sorted(arising[side]) for side in self.container]
-        at_most(f"{key}: the container gives", math.prod(map(len, sides_of_items)), "kinds of items", MAX_KINDS)
+        refuse_above(f"{key}: the container gives", math.prod(map(len, sides_of_items)), "kinds of items", MAX_KINDS)
         self.sizes = torch.tensor(list(product(*sides_of_items)))
         self._num_cuts = torch.tensor([len(places) for places in cuts])
         self._cuts = torch.tensor([places + [0] * (longest - len(places)) for places in cuts])
         self._layers = self.container[2] // least
-        self._kept = KeptEpisodes(self._sizes, max(1, 2**22 // count**2))  # for the memory of `_arrival`
+        self._kept = EpisodeCache(self._sizes, max(1, 2**22 // count**2))  # for the memory of `_arrival`
 
     def num_items(self, stream, seed, episode):
-        return torch.tensor([*map(len, self._kept.all_of(stream, seed, episode))], device=episode.device)
+        return torch.tensor([*map(len, self._kept.sequences(stream, seed, episode))], device=episode.device)
 
     def sample(self, stream, seed, episode, step, bin_size, mix=None):
         _, across, along = hashed_uniform(stream, seed, episode, step, 3)
-        size = self._kept.at(stream, seed, episode, step, end=[0, 0, 0])
+        size = self._kept.step_elements(stream, seed, episode, step, end=[0, 0, 0])
         sizes = torch.tensor(size, dtype=torch.int64, device=step.device).view(-1, 3)
         item = place_at_random(sizes, across, along, bin_size)
         return item.map(lambda part: torch.where(item.exists, part, 0))

@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 from typing_extensions import Self
 
+from pickplace.common.capture import constant_on
 from pickplace.common.files import read_table
-from pickplace.common.recording import constant_on
-from pickplace.common.validate import at_most, excerpt, expect, flag, is_number, is_whole, refuse_any, whole_number
+from pickplace.common.validate import excerpt, expect, flag, is_number, is_whole, refuse_above, refuse_any, whole_number
 from pickplace.rules.item import ALL_TURNS, MAX_GRAMS, NO_LIMIT, Item
 
 #: Families of item streams that share no episodes: to train, to select the best checkpoint, and to report results.
@@ -169,13 +169,13 @@ class ItemDistribution:
         """
         raise ValueError(f"items: {type(self).__name__} has no mixes; expected items=kinds or items=mixed.")
 
-    def arrives(self, mix: int = 0) -> Tensor:
+    def arrival_mask(self, mix: int = 0) -> Tensor:
         """Return a mask of the rows of ``sizes`` that may arrive in a mix, bool ``[K]``."""
         return torch.ones(len(self.sizes), dtype=torch.bool)
 
     def tallest(self, mix: int = 0) -> int:
         """Return the height of the tallest item of a mix."""
-        return int(self.sizes[self.arrives(mix), 2].max())
+        return int(self.sizes[self.arrival_mask(mix), 2].max())
 
     def spread(self, seed: Tensor, rank: Tensor, count: int, bin_size, mix: Tensor | None = None) -> Item:
         """Return the ``rank``-th of ``count`` items for each seed, int64 ``[N]``; here they are independent."""
@@ -207,7 +207,7 @@ class Kinds(ItemDistribution):
 
     def __init__(self, kinds, weights=None, grams=None, max_load=None, turns=None):
         expect(isinstance(kinds, (list, tuple)) and kinds, "items.kinds", kinds, "a list of at least one (w, d, h)")
-        at_most("items.kinds: the list has", len(kinds), "kinds of items", MAX_KINDS)
+        refuse_above("items.kinds: the list has", len(kinds), "kinds of items", MAX_KINDS)
         if bad := [kind for kind in kinds if not _are_lengths(kind, 3)]:
             raise ValueError(f"items.kinds: got {excerpt(bad[0])}, expected (w, d, h) in positive whole cells.")
         weights = [1.0] * len(kinds) if weights is None else weights
@@ -271,7 +271,7 @@ class Kinds(ItemDistribution):
         expect(bool(share.any()), "items", dict(change), "sizes that some kind of the full task has")
         return share
 
-    def arrives(self, mix: int = 0) -> Tensor:
+    def arrival_mask(self, mix: int = 0) -> Tensor:
         return self._share[mix] > 0
 
     def spread(self, seed: Tensor, rank: Tensor, count: int, bin_size, mix: Tensor | None = None) -> Item:
@@ -299,7 +299,7 @@ class Uniform(Kinds):
         pairs = (check_range(f"items.{name}", limits) for name, limits in ranges.items())
         lengths = [range(low, high + 1) for low, high in pairs]
         words = ", ".join(f"items.{name}={[*limits]}" for name, limits in ranges.items())
-        at_most(f"{words}: the ranges have", math.prod(map(len, lengths)), "kinds of items", MAX_KINDS)
+        refuse_above(f"{words}: the ranges have", math.prod(map(len, lengths)), "kinds of items", MAX_KINDS)
         whole_number("items.unit", unit, most=MAX_LENGTH)
         super().__init__([tuple(unit * side for side in sides) for sides in product(*lengths)])
 

@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 #: Greatest number of episodes that are kept, or twice the number played side by side if that is more.
-KEPT_EPISODES = 1024
+MAX_CACHED_EPISODES = 1024
 
 
-class KeptEpisodes:
+class EpisodeCache:
     """Cache of the sequences of episodes.
 
     Args:
@@ -21,13 +21,13 @@ class KeptEpisodes:
         self._make, self._at_once = make, at_once
         self._kept: dict[tuple[str, int, int], Sequence] = {}
 
-    def at(self, stream: str, seed: Tensor, episode: Tensor, step: Tensor, end) -> list:
+    def step_elements(self, stream: str, seed: Tensor, episode: Tensor, step: Tensor, end) -> list:
         """Return the element at a step of each episode, int64 ``[N]``; ``end`` after the last one."""
         seed, episode, step = torch.broadcast_tensors(seed, episode, step)
-        sequences = self.all_of(stream, seed, episode)
+        sequences = self.sequences(stream, seed, episode)
         return [[*sequence[at : at + 1], end][0] for sequence, at in zip(sequences, step.tolist(), strict=True)]
 
-    def all_of(self, stream: str, seed: Tensor, episode: Tensor) -> list[Sequence]:
+    def sequences(self, stream: str, seed: Tensor, episode: Tensor) -> list[Sequence]:
         """Return the sequence of each episode, int64 ``[N]``."""
         keys = [(stream, *key) for key in zip(seed.tolist(), episode.tolist(), strict=True)]
         unseen = list(dict.fromkeys(key for key in keys if key not in self._kept))
@@ -36,6 +36,6 @@ class KeptEpisodes:
             made = self._make(stream, *torch.tensor([key[1:] for key in some]).unbind(1))
             self._kept.update(zip(some, made, strict=True))
         found = [self._kept[key] for key in keys]
-        if len(self._kept) > max(KEPT_EPISODES, 2 * len(keys)):
+        if len(self._kept) > max(MAX_CACHED_EPISODES, 2 * len(keys)):
             self._kept = {key: self._kept[key] for key in keys}
         return found

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from pickplace.common.files import MAX_TABLE_BYTES, csv_rows, read_text
-from pickplace.common.validate import at_most, excerpt, expect, refuse_if, reworded, without_twins
+from pickplace.common.validate import excerpt, expect, refuse_above, refuse_if, reword_errors, unique_keys
 from pickplace.rules.item import MAX_GRAMS, NO_LIMIT
 
 #: Name of a column -> the names that a file may have for it, in any case; a unit may follow, as in ``length/mm``.
@@ -175,7 +175,7 @@ def read_orders(path, unit: str = "mm", key: str = "items.path", target: str | N
             f"{item.place}: item {excerpt(item.id)} is {_words(item)}, but {_words(known)} in {known.place}; "
             "expected one size and weight for each id.",
         )
-        at_most(f"{path}:", total := total + quantity, "items", MAX_ITEMS)
+        refuse_above(f"{path}:", total := total + quantity, "items", MAX_ITEMS)
         goal = _name(item.place, row, columns[header], "target")
         targets[goal] = None
         if target in (None, goal):
@@ -222,8 +222,8 @@ def _rows_of_json(path: Path, text: str) -> Iterator[_Row]:
             f'{path}: {what}; expected {{order: {{"item_sequence": {{"1": item, ...}}}}}}, as of BED-BPP.'
         )
 
-    with reworded((ValueError, RecursionError), lambda error: wrong(f"it cannot be read ({error})")):
-        orders = json.loads(text, object_pairs_hook=without_twins)
+    with reword_errors((ValueError, RecursionError), lambda error: wrong(f"it cannot be read ({error})")):
+        orders = json.loads(text, object_pairs_hook=unique_keys)
     if not isinstance(orders, dict):
         raise wrong(f"got {excerpt(orders)}")
     for name, order in orders.items():

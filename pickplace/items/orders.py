@@ -7,9 +7,9 @@ from itertools import groupby
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import at_most, expect, flag, is_name, number, one_of, refuse_if
+from pickplace.common.validate import expect, flag, is_name, number, one_of, refuse_above, refuse_if
 from pickplace.items.distributions import MAX_KINDS, MAX_LENGTH, ItemDistribution, hashed_uniform
-from pickplace.items.kept import KeptEpisodes
+from pickplace.items.kept import EpisodeCache
 from pickplace.items.order_file import MILLIMETRES, OrderItem, read_orders
 
 #: Shares of the orders for validation and test; the others are for training. Each stream has at least one.
@@ -66,7 +66,7 @@ class Orders(ItemDistribution):
             f"items.path={str(path)!r}: the file has {len(distinct)} different orders; expected three at least, for "
             "train, validation and test, or items.split=false, which tests with all orders.",
         )
-        at_most(f"items.path={str(path)!r}: the file has", len(kinds), "kinds of items", MAX_KINDS)
+        refuse_above(f"items.path={str(path)!r}: the file has", len(kinds), "kinds of items", MAX_KINDS)
         self.sizes = torch.tensor([self.cells(item) for item in self._examples])
         columns = [(item.turns, item.grams, item.max_load) for item in self._examples]
         self.handling = torch.tensor(columns)
@@ -76,7 +76,7 @@ class Orders(ItemDistribution):
         self.volumes = sides.prod(1) / (self._cell**2 * self._unit)
         self._orders = _split(distinct) if split else {"train": [], "validation": [], "test": distinct}
         self._lines = _Lines(self._orders["train"] or distinct)
-        self._kept = KeptEpisodes(self._play, max(1, 2**22 // self._lines.most))
+        self._kept = EpisodeCache(self._play, max(1, 2**22 // self._lines.most))
 
     def _number(self, item: OrderItem, kinds: dict) -> int:
         """Return the number of an item's kind: its sides, weight, greatest load and orientations."""
@@ -103,10 +103,10 @@ class Orders(ItemDistribution):
         return None if stream == "train" else len(self._orders[stream])
 
     def num_items(self, stream, seed, episode):
-        return torch.tensor([*map(len, self._kept.all_of(stream, seed, episode))], device=episode.device)
+        return torch.tensor([*map(len, self._kept.sequences(stream, seed, episode))], device=episode.device)
 
     def sample(self, stream, seed, episode, step, bin_size, mix=None):
-        kind = torch.tensor(self._kept.at(stream, seed, episode, step, end=-1), device=step.device)
+        kind = torch.tensor(self._kept.step_elements(stream, seed, episode, step, end=-1), device=step.device)
         _, across, along = hashed_uniform(stream, seed, episode, step, 3)
         item = self.of_kind(kind, across, along, bin_size)
         return item.map(lambda part: torch.where(kind >= 0, part, 0))

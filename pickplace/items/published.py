@@ -9,9 +9,18 @@ from typing import Any
 
 import torch
 
+from pickplace.common.capture import constant_on
 from pickplace.common.files import MAX_TABLE_BYTES, read_file
-from pickplace.common.recording import constant_on
-from pickplace.common.validate import at_most, excerpt, expect, is_whole, or_null, refuse_if, reworded, size_tuple
+from pickplace.common.validate import (
+    excerpt,
+    expect,
+    is_whole,
+    or_null,
+    refuse_above,
+    refuse_if,
+    reword_errors,
+    size_tuple,
+)
 from pickplace.items.distributions import MAX_KINDS, MAX_LENGTH, ItemDistribution, hashed_uniform, place_at_random
 
 MAX_ITEMS = 2_000_000  # of a file
@@ -59,7 +68,7 @@ class Published(ItemDistribution):
                     self._first[len(sizes)] = f"{self.path}, sequence {row}, item {column}"
                     sizes.append(size)
                 numbers.append(kinds[size])
-        at_most(f"{path}: the file and the drawn items have", len(sizes), "kinds of items", MAX_KINDS)
+        refuse_above(f"{path}: the file and the drawn items have", len(sizes), "kinds of items", MAX_KINDS)
         self.sizes, self._kinds = torch.tensor(sizes), torch.tensor(numbers)
         self._lengths = torch.tensor([*map(len, sequences)])
         self._starts = self._lengths.cumsum(0) - self._lengths
@@ -88,8 +97,8 @@ class Published(ItemDistribution):
         other.__dict__ |= self.__dict__ | {"drawn": (drawn := self.drawn.mixed(changes)), "mixes": drawn.mixes}
         return other
 
-    def arrives(self, mix=0):
-        return torch.cat([self.drawn.arrives(mix), torch.ones(len(self._first), dtype=torch.bool)])
+    def arrival_mask(self, mix=0):
+        return torch.cat([self.drawn.arrival_mask(mix), torch.ones(len(self._first), dtype=torch.bool)])
 
     def spread(self, seed, rank, count, bin_size, mix=None):
         return self.drawn.spread(seed, rank, count, bin_size, **self.mix_arguments(mix))
@@ -121,7 +130,7 @@ def read_sequences(path, end: Sequence[int] | None = None) -> list[list[tuple[in
         if end is not None and sequence and sequence[-1] == tuple(end):
             del sequence[-1]
         refuse_if(not sequence, f"{place}: no items, expected at least one.")
-        at_most(f"{path}:", total := total + len(sequence), "items", MAX_ITEMS)
+        refuse_above(f"{path}:", total := total + len(sequence), "items", MAX_ITEMS)
         sequences.append(sequence)
     refuse_if(not sequences, f"{path}: no sequences, expected at least one.")
     return sequences
@@ -130,9 +139,11 @@ def read_sequences(path, end: Sequence[int] | None = None) -> list[list[tuple[in
 def _load(path: Path, content: bytes) -> Any:
     """Return the content of a file; from a ``.pt`` only plain data, as it could run any code otherwise."""
     if path.suffix.lower() == ".pt":
-        with reworded(Exception, lambda error: ValueError(f"{path}: it is not read by torch; expected {EXPECTED}.")):
+        with reword_errors(
+            Exception, lambda error: ValueError(f"{path}: it is not read by torch; expected {EXPECTED}.")
+        ):
             return torch.load(io.BytesIO(content), weights_only=True)
-    with reworded(
+    with reword_errors(
         (ValueError, RecursionError),
         lambda error: ValueError(
             f"{path}, line {getattr(error, 'lineno', 1)}: {getattr(error, 'msg', error)}; expected {EXPECTED}."

@@ -7,7 +7,7 @@ the bin, too. Poses follow one another in the bin's table: upright as it arrives
 import torch
 from torch import Tensor
 
-from pickplace.common.recording import constant_on
+from pickplace.common.capture import constant_on
 from pickplace.common.validate import expect, refuse_any, refuse_if
 from pickplace.items.distributions import ItemDistribution
 from pickplace.rules.cell import POSES, CellSpec
@@ -17,7 +17,7 @@ from pickplace.rules.item import ALL_TURNS, Item
 SIDES = (("w", "d", "h"), ("w", "h", "d"), ("d", "h", "w"))
 
 
-def in_pose(cell: CellSpec, source: ItemDistribution, item: Item, pose: int) -> Item:
+def tipped_items(cell: CellSpec, source: ItemDistribution, item: Item, pose: int) -> Item:
     """Return arriving items, ``[N]``, as they lie in a pose, in the corner of the bin; unchanged without ``tipping``.
 
     Args:

@@ -15,11 +15,11 @@ from pickplace.physics.simulation import Loss, Simulation, wait
 HEADROOM = 0.02  # distance between the carried item and the rims, m
 TURNING_SPEED = 4.0  # greatest speed of the hinge, rad/s
 STIFFNESS = 2e5, 2e3  # stiffness of the drives of the slides, N/m, and of the hinge, N m/rad
-SLOW_WAY = 0.03  # length of the slow part, the last one of a way down and the first one of a way up; m
+SLOW_DISTANCE = 0.03  # length of the slow part, the last one of a way down and the first one of a way up; m
 SETTLING_TIME = 0.05  # time for the plate to come to rest, s
 WAKING_FORCE = 1e-6  # force that wakes a body, N
 REACH = 0.0005  # distance by which suction can stretch a lip, m
-STEPS_PER_LOOK = 2  # steps of the simulation between two looks at contacts and forces
+STEPS_PER_CHECK = 2  # steps of the simulation between two looks at contacts and forces
 
 
 @dataclass(frozen=True)
@@ -213,7 +213,7 @@ class Gantry(Scene):
         """
         start, way = self.goal, np.subtract(goal, self.goal)
         seconds = 1.5 * max(np.linalg.norm(way[:3]) / (speed or self.options.speed), abs(way[3]) / TURNING_SPEED)
-        count = 1 + round(seconds / TIMESTEP / STEPS_PER_LOOK)
+        count = 1 + round(seconds / TIMESTEP / STEPS_PER_CHECK)
         for step in range(1, count + 1):
             share = step / count
             self.data.ctrl[:] = self.goal = start + way * share**2 * (3 - 2 * share)
@@ -255,15 +255,15 @@ class Gantry(Scene):
     def lower(self, goal) -> Loss | None:
         """Move the plate down, the last centimetres slowly, and let it come to rest."""
         x, y, z, turn = goal
-        loss = self.travel((x, y, z + SLOW_WAY, turn)) or self.travel(goal, self.options.slow_speed)
-        for _ in range(round(SETTLING_TIME / TIMESTEP / STEPS_PER_LOOK)):
+        loss = self.travel((x, y, z + SLOW_DISTANCE, turn)) or self.travel(goal, self.options.slow_speed)
+        for _ in range(round(SETTLING_TIME / TIMESTEP / STEPS_PER_CHECK)):
             loss = loss or self._step()
         return loss
 
     def lift(self, z: float) -> Loss | None:
         """Move the plate up, the first centimetres slowly."""
         x, y, low, turn = self.goal
-        return self.travel((x, y, low + SLOW_WAY, turn), self.options.slow_speed) or self.travel((x, y, z, turn))
+        return self.travel((x, y, low + SLOW_DISTANCE, turn), self.options.slow_speed) or self.travel((x, y, z, turn))
 
     def grip(self) -> Loss | None:
         """Grip the item in the bin; return a loss if the lip does not reach it, or also reaches another item."""
@@ -290,11 +290,11 @@ class Gantry(Scene):
         return False
 
     def _step(self) -> Loss | None:
-        """Simulate :data:`STEPS_PER_LOOK` steps; return the loss during them."""
+        """Simulate :data:`STEPS_PER_CHECK` steps; return the loss during them."""
         item = self.boxes[-1]
         velocity = self.data.qvel[self.model.body_dofadr[item.id] :][:3]
         before = velocity.copy()
-        self.step(STEPS_PER_LOOK)
+        self.step(STEPS_PER_CHECK)
         if self.diverged:
             return self.loss("diverged")
         pairs, force, total = self.data.contact.geom, np.zeros(6), 0.0
@@ -306,7 +306,7 @@ class Gantry(Scene):
             return self.loss("effector_contact")
         if self.holding:
             # From the motion: as the drives are integrated implicitly, the weld does not report the force it transmits.
-            acceleration = (velocity - before) / (STEPS_PER_LOOK * TIMESTEP) - self.model.opt.gravity
+            acceleration = (velocity - before) / (STEPS_PER_CHECK * TIMESTEP) - self.model.opt.gravity
             if self.model.body_mass[item.id] * np.linalg.norm(acceleration) > self.options.suction:
                 return self.loss("dropped")
         waits = {body.id: (*(self.bin + box[:2]), 0.0) + np.divide(box[2:], 2) for box, body in self.waiting.items()}

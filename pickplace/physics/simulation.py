@@ -21,8 +21,8 @@ from pickplace.views.motion import Motion, Outcome
 REST_SPEEDS = np.repeat((0.002, 0.02), 3)
 #: Time for items to come to rest after a placement, at least and at most, and at the end of an episode; s.
 MIN_WAIT, MAX_WAIT, FINAL_WAIT = 0.06, 1.0, 1.0
-AFTERMATH = 1.0  # time for which a recorded motion goes on after a collapse, s
-LOOK = 0.02  # time between two looks at the speeds, s
+TIME_AFTER_LOSS = 1.0  # time for which a recorded motion goes on after a collapse, s
+CHECK_INTERVAL = 0.02  # time between two looks at the speeds, s
 
 
 class Loss(NamedTuple):
@@ -148,7 +148,7 @@ class Simulation(ABC):
         )
         if scene.motion:
             if loss and loss.reason == "collapsed":
-                scene.run(AFTERMATH)
+                scene.run(TIME_AFTER_LOSS)
             scene.finish_motion()
             scene.motion.ends = [*scene.motion.ends[: count - 1], scene.motion.pictures]
         return outcome
@@ -172,7 +172,7 @@ class Simulation(ABC):
 def wait(scene: Scene) -> None:
     """Simulate until all items are at rest, for at most :data:`MAX_WAIT`."""
     scene.run(MIN_WAIT)
-    for _ in range(round((MAX_WAIT - MIN_WAIT) / LOOK)):
+    for _ in range(round((MAX_WAIT - MIN_WAIT) / CHECK_INTERVAL)):
         if (np.abs(scene.data.qvel[-6 * len(scene.bodies) :].reshape(-1, 6)) < REST_SPEEDS).all():  # six speeds a body
             return
-        scene.run(LOOK)
+        scene.run(CHECK_INTERVAL)

@@ -9,7 +9,7 @@ from torch import Tensor
 from pickplace.common.validate import number, or_null, refuse_if, whole_number
 from pickplace.planners.base import MapPlanner
 from pickplace.policies.base import EstimatesValue, Policy, ScoresFootprints
-from pickplace.rules.bin import let_in
+from pickplace.rules.bin import admit_coming_items
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Observation
 from pickplace.rules.masks import PlacingMaps, first_action_reaching, placing_maps
@@ -116,7 +116,7 @@ class Beam(MapPlanner):
         first = torch.where(plans.first[row] < 0, choice, plans.first[row])
         # The states of all plans would not fit into the memory; those of the kept ones are computed again.
         after, _ = put_down(self.cell, plans.state.rows(row), choice)
-        state, awaits = let_in(self.cell, after)
+        state, awaits = admit_coming_items(self.cell, after)
         return _Plans(plans.problem[row], first, placed[kept], total[kept], state, awaits | plans.awaits[row])
 
     def _judge(self, plans: _Plans, row: Tensor, choice: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -125,7 +125,7 @@ class Beam(MapPlanner):
         Args:
             row, choice: the plan and the choice, int64 ``[C]``.
         """
-        after, volume, value = self.policy.judge(plans.state.rows(row), choice)
+        after, volume, value = self.policy.evaluate_choices(plans.state.rows(row), choice)
         placed = plans.placed[row] + volume
         return (
             placed,

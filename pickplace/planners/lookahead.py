@@ -10,7 +10,7 @@ from pickplace.items.arrival import refill
 from pickplace.items.distributions import ItemDistribution, check_seed, search_items
 from pickplace.planners.base import MapPlanner
 from pickplace.policies.base import MASKED, EstimatesValue, Policy, ScoresFootprints, best_choice
-from pickplace.rules.bin import let_in
+from pickplace.rules.bin import admit_coming_items
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Item, Observation
 from pickplace.rules.masks import PlacingMaps, first_action_reaching, placing_maps
@@ -180,7 +180,7 @@ class Lookahead(MapPlanner):
                 volume[row] += self.critic(seen)[:, 0].double()
                 break
             address = seed[row], stream[row], arrived
-            state, open_ = let_in(cell, state)
+            state, open_ = admit_coming_items(cell, state)
             items, arrived = refill(cell, source, "train", *address, state.items, open_, state.episode)
             state = state._replace(items=items)
             mask = policy.ranked(placing_maps(cell, state))

@@ -12,7 +12,7 @@ from pickplace.common.validate import flag, number, whole_number
 from pickplace.items.arrival import refill
 from pickplace.items.distributions import ItemDistribution, check_seed, search_items
 from pickplace.planners.base import MapPlanner, narrow_first
-from pickplace.rules.bin import let_in, remove_item
+from pickplace.rules.bin import admit_coming_items, remove_item
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Item, Observation
 from pickplace.rules.masks import (
@@ -235,7 +235,7 @@ class MCTS(MapPlanner):
 
         Unseen items come from the item distribution, with one draw for each state.
         """
-        state, rows = let_in(self.cell, state)
+        state, rows = admit_coming_items(self.cell, state)
         number = torch.arange(self._sampled, self._sampled + len(state.surface))
         self._sampled += len(number)
         seed, first = torch.full_like(number, self.seed), torch.zeros_like(number)

@@ -64,7 +64,7 @@ def _spaces_on(heights: Tensor, row: Tensor, floor: Tensor, level_step: int) -> 
     free = heights <= level + level_step  # [F, W_T, D_T]
     run = torch.where(free, deep, y).flip(2).cummin(2).values.flip(2) - y
     x = torch.arange(wide, device=heights.device)[:, None]
-    x0, x1 = x - _reach(run), x + 1 + _reach(run.flip(1)).flip(1)
+    x0, x1 = x - _run_extent(run), x + 1 + _run_extent(run.flip(1)).flip(1)
     before = F.pad(free[:, :, :-1], (1, 0))  # whether the cell before along y is free
     closed = F.pad((~before).cumsum(1), (0, 0, 1, 0))
     grows = closed.gather(1, x1) == closed.gather(1, x0)
@@ -76,7 +76,7 @@ def _spaces_on(heights: Tensor, row: Tensor, floor: Tensor, level_step: int) -> 
     return Spaces(*(part[count > 0] for part in spaces))
 
 
-def _reach(run: Tensor) -> Tensor:
+def _run_extent(run: Tensor) -> Tensor:
     """Return the number of successive cells towards x = 0 whose runs are no shorter, int64 of the same shape."""
     reach, going = torch.zeros_like(run, dtype=torch.int64), run > 0
     for step in range(1, run.shape[1]):

@@ -25,7 +25,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import ValueOperator
 from typing_extensions import Self
 
-from pickplace.common.validate import at_most, expect, refuse_if
+from pickplace.common.validate import expect, refuse_above, refuse_if
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import Observation
 from pickplace.rules.maps import FAR
@@ -238,7 +238,7 @@ class EstimatesValue(Protocol):
     def items_left(self, observation: Observation, choice: Tensor) -> Tensor:
         """Return the items that are seen after a choice, before others arrive, int64 ``[N, M + p, 5]``."""
 
-    def judge(self, before: State, choice: Tensor) -> tuple[State, Tensor, Tensor]:
+    def evaluate_choices(self, before: State, choice: Tensor) -> tuple[State, Tensor, Tensor]:
         """Return the states after choices and before items arrive, the volumes placed, int64 ``[N]``, and the values of
         these states, float32 ``[N]``, in the scale of the network.
 
@@ -287,7 +287,7 @@ class ScoresAnySize(Protocol):
         entries ``in_keys`` except the masks."""
 
 
-class Choice(Categorical):
+class ChoiceDistribution(Categorical):
     """A categorical distribution over choices, without the checks that dominate a small PPO update."""
 
     def __init__(self, logits: Tensor):
@@ -363,7 +363,7 @@ def refuse_large_network(make: Callable[[], torch.nn.Module], key: str) -> None:
     except RuntimeError:  # meta tensors have no values
         return
     count = sum(parameter.numel() for parameter in network.parameters())
-    at_most(f"{key}: the network has", count, "parameters", MAX_PARAMETERS)
+    refuse_above(f"{key}: the network has", count, "parameters", MAX_PARAMETERS)
 
 
 def as_critic(critic: torch.nn.Module) -> ValueOperator:
@@ -378,7 +378,7 @@ def as_actor(policy: Policy) -> ProbabilisticTensorDictSequential:
         ProbabilisticTensorDictModule(
             in_keys=["logits"],
             out_keys=[policy.choice_key],
-            distribution_class=Choice,
+            distribution_class=ChoiceDistribution,
             default_interaction_type=ExplorationType.RANDOM,
             return_log_prob=True,
             log_prob_key="log_prob",

@@ -8,7 +8,7 @@ from torch import Tensor
 from pickplace.rules.item import Item
 
 
-class Contents(NamedTuple):
+class ScoredItems(NamedTuple):
     """The items in the bins, and the number of the item of each footprint that is scored."""
 
     items: Item  # [N, M]

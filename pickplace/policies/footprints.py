@@ -10,11 +10,11 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from pickplace.common.recording import is_recording
+from pickplace.common.capture import is_capturing
 from pickplace.common.validate import expect
 from pickplace.envs.masks import MASKS
 from pickplace.policies.base import MAP_KEYS, MASKED, Policy, Ranking, best_choice, pick_one
-from pickplace.policies.depth import Contents
+from pickplace.policies.depth import ScoredItems
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import footprint_index
 from pickplace.rules.item import Observation, items_from_observation
@@ -99,13 +99,15 @@ class FootprintScorer(Policy):
         """
         bins, totes, bearing = (observation[key] for key in MAP_KEYS)
         places = self.cell.footprint_turns * totes.shape[1] * totes.shape[2]
-        contents = Contents(items_from_observation(observation), footprint // places)
-        return self.network.at(bins, totes, bearing, row, footprint - contents.number * places, contents)[:, 0]
+        contents = ScoredItems(items_from_observation(observation), footprint // places)
+        return self.network.footprint_scores(bins, totes, bearing, row, footprint - contents.number * places, contents)[
+            :, 0
+        ]
 
     def footprint_logits(self, observation: Observation, mask: Tensor) -> Tensor:
         """Return logits of footprints, computed only where a mask ``[N, M * Q * W_T * D_T]`` allows them; else
         :data:`MASKED`."""
-        if is_recording():
+        if is_capturing():
             return torch.where(mask, self.unmasked_scores(observation), MASKED)
         row, footprint = mask.nonzero(as_tuple=True)
         scores = self.scores(observation, row, footprint)

@@ -20,7 +20,7 @@ TOLERANCE = 5e-5  # greatest difference between onnxruntime and torch, as a shar
 #: Numbers of cells by which the totes, and the bins, of each check are larger than in training.
 CHECKS = (((1, 4), (0, 0)), ((3, 0), (0, 0)), ((7, 5), (1, 2)))
 ENVS, STEPS = 3, 8  # each check has ENVS * STEPS problems at most
-MOST_FOOTPRINTS = 2_000  # of all problems of a check, if these are more than one: on a fine grid each takes seconds
+MAX_FOOTPRINTS = 2_000  # of all problems of a check, if these are more than one: on a fine grid each takes seconds
 
 N = Dim("N")
 
@@ -94,7 +94,7 @@ def export_onnx(checkpoint, path, trust: Sequence[str] = (), **sizes) -> dict[tu
                 for key, size, step in (("tote_size", cell.tote_size, more_tote), ("bin_size", cell.bin_size, more_bin))
             }
             other = _load(checkpoint, trust, **{**sizes, **grown})
-            asked = _some_problems(_observations(other, keys, STEPS), MOST_FOOTPRINTS // other.cell.num_choices)
+            asked = _some_problems(_observations(other, keys, STEPS), MAX_FOOTPRINTS // other.cell.num_choices)
             with torch.no_grad():
                 expected = Scores(other.policy, keys)(*asked)
             found = session.run(None, {key: entry.numpy() for key, entry in zip(keys, asked, strict=True)})[0]

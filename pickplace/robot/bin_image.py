@@ -9,17 +9,17 @@ from scipy import ndimage
 
 from pickplace.common.validate import refuse_if
 from pickplace.robot.box import Box, DepthMapError, HiddenBox, UnknownBox
-from pickplace.robot.depth_image import AROUND, Heights, Room, distance_outside, level_range
-from pickplace.robot.measure import SNAPPED, is_inside, smallest_rectangle, turned_axes
+from pickplace.robot.depth_image import EIGHT_NEIGHBOURS, Heights, Room, distance_outside, level_range
+from pickplace.robot.measure import PARALLEL_TOLERANCE, is_inside, smallest_rectangle, turned_axes
 from pickplace.robot.room_check import fit_plane
 
-MOST_MISSING = 0.01  # greatest share of the inside of its rectangle that an item's top may leave free
+MAX_FREE_SHARE = 0.01  # greatest share of the inside of its rectangle that an item's top may leave free
 BORDER = 2.5  # width of the rectangle's border, pixels; the rest is its inside
 LONGEST_GAP = 3.5  # longest gap beyond the seen edge of an item, pixels; a wall that hides more allows more
 HIDDEN_PIXELS = 1.5  # distance from a box at which its edge should be seen, pixels
 EDGE_POINTS = 32  # number of points along each side of a box, and along each ray
 MIN_ITEM_PIXELS = 9  # fewest pixels of a thing in a bin; smaller ones are ignored
-MOST_HIDDEN = 0.25  # greatest share of the bin's floor that holes may hide
+MAX_HIDDEN_SHARE = 0.25  # greatest share of the bin's floor that holes may hide
 
 
 def find_boxes(
@@ -45,7 +45,7 @@ def find_boxes(
     surface = seen.surface(room)
     segments = _segments(seen, above, accuracy, labels)
     numbers, counts = np.unique(segments[segments > 0], return_counts=True)
-    boxes, floor, free = [], seen.at(0.0), np.ones_like(seen.holes)
+    boxes, floor, free = [], seen.points_at_height(0.0), np.ones_like(seen.holes)
     for number in numbers[counts >= MIN_ITEM_PIXELS]:
         box, seen_top = _read_box(seen, room, margin, surface, segments, number, above, accuracy, labels is None)
         boxes.append(box)
@@ -77,7 +77,7 @@ def _segments(seen: Heights, above: np.ndarray, accuracy: float, labels: np.ndar
         high = ndimage.maximum_filter(np.where(known, seen.height, -np.inf), 3)
         low = ndimage.minimum_filter(np.where(known, seen.height, np.inf), 3)
         return ndimage.label(above & (high - low < 4 * accuracy + seen.pixel))[0]
-    named = ndimage.binary_dilation(labels > 0, AROUND, iterations=2)
+    named = ndimage.binary_dilation(labels > 0, EIGHT_NEIGHBOURS, iterations=2)
     if (left := above & ~named).sum() >= MIN_ITEM_PIXELS:
         row, column = np.argwhere(left)[0].tolist()
         raise DepthMapError(
@@ -103,9 +103,9 @@ def _read_box(
     top, band = segments == number, level_range(accuracy)
     height = float(np.quantile(seen.height[top], 0.95))
     if narrowed:
-        near = ndimage.binary_dilation(top, AROUND) & above & (segments == 0)
+        near = ndimage.binary_dilation(top, EIGHT_NEIGHBOURS) & above & (segments == 0)
         top = top | (near & (np.abs(seen.height - height) <= band))
-    points, pixel = seen.at(height), seen.pixel * (seen.origin[2] - height) / seen.origin[2]
+    points, pixel = seen.points_at_height(height), seen.pixel * (seen.origin[2] - height) / seen.origin[2]
     x, y, w, d, yaw = smallest_rectangle(points[top])
     _check_top(seen, (x, y, w, d, yaw), points, top, pixel, accuracy)
     # Each side may be as far out as the first ray in front of it that passes the height of the top.
@@ -161,18 +161,18 @@ def _check_top(
         top: bool ``[rows, columns]``.
     """
     x, y, w, d, yaw = rectangle
-    border = (BORDER - 1) * pixel + SNAPPED * max(w, d) * (yaw == 0)
+    border = (BORDER - 1) * pixel + PARALLEL_TOLERANCE * max(w, d) * (yaw == 0)
     inside = is_inside(points, (x, y), (w - 2 * border, d - 2 * border), yaw)
     found = f"depth: what lies at [{x:.3f}, {y:.3f}]"
     if (
         inside.any()
-        and (missing := float((inside & ~top & ~np.isnan(seen.height)).sum() / inside.sum())) > MOST_MISSING
+        and (missing := float((inside & ~top & ~np.isnan(seen.height)).sum() / inside.sum())) > MAX_FREE_SHARE
     ):
         raise DepthMapError(
             f"{found} leaves {missing:.0%} of its rectangle of {w + pixel:.3f} x {d + pixel:.3f} m free: it could be "
             "two items that touch, or one that is no cuboid; separate them, or pass labels."
         )
-    inner = ndimage.binary_erosion(top, AROUND)
+    inner = ndimage.binary_erosion(top, EIGHT_NEIGHBOURS)
     inner = inner if inner.sum() >= MIN_ITEM_PIXELS else top
     heights = seen.height[inner]
     plane = fit_plane(points[inner], heights)
@@ -194,7 +194,7 @@ def _rest(seen: Heights, above: np.ndarray, boxes: Sequence[Box]) -> list[Box]:
     left, points = above.copy(), seen.points
     for box in boxes:
         left &= ~is_inside(points, (box.x, box.y), (box.w + 5 * seen.pixel, box.d + 5 * seen.pixel), box.yaw)
-    parts, count = ndimage.label(left, AROUND)
+    parts, count = ndimage.label(left, EIGHT_NEIGHBOURS)
     found = (parts == number for number in range(1, count + 1))
     return [
         _around(points[part], seen.pixel, float(seen.height[part].max()))
@@ -211,14 +211,14 @@ def _behind_holes(
     Args:
         free: bool, False where an item stands: a hole there shows the item's side.
     """
-    floor = seen.at(0.0)
+    floor = seen.points_at_height(0.0)
     holes = seen.holes_above(0.0, surface, room, accuracy, free)
     refuse_if(
-        (share := holes.sum() / (distance_outside(floor, room) < 0).sum()) > MOST_HIDDEN,
-        f"depth: {share:.0%} of the bin are not seen, expected {MOST_HIDDEN:.0%} at most: take another image.",
+        (share := holes.sum() / (distance_outside(floor, room) < 0).sum()) > MAX_HIDDEN_SHARE,
+        f"depth: {share:.0%} of the bin are not seen, expected {MAX_HIDDEN_SHARE:.0%} at most: take another image.",
         DepthMapError,
     )
-    parts, count = ndimage.label(holes, AROUND)
+    parts, count = ndimage.label(holes, EIGHT_NEIGHBOURS)
     found = [_around(floor[parts == number], seen.pixel, greatest) for number in range(1, count + 1)]
     for box in found:
         refuse_if(

@@ -21,7 +21,7 @@ from pickplace.robot.room_check import check_room
 from pickplace.robot.tote_image import read_tote
 from pickplace.rules.cell import CellSpec
 
-LEAST_PIXELS = 2  # fewest pixels along a cell
+MIN_PIXELS = 2  # fewest pixels along a cell
 
 
 @dataclass(frozen=True)
@@ -132,13 +132,13 @@ class Camera:
         rim = cell.tote_size[2] * cell.height_unit * cell_size if tote_height is None else tote_height
         pixel = self.pixel()
         refuse_if(
-            pixel * LEAST_PIXELS > cell_size,
-            f"depth: a cell is {cell_size / pixel:.1f} pixels wide, expected at least {LEAST_PIXELS}.",
+            pixel * MIN_PIXELS > cell_size,
+            f"depth: a cell is {cell_size / pixel:.1f} pixels wide, expected at least {MIN_PIXELS}.",
             DepthMapError,
         )
         room = self._room("tote", cell.tote_size, cell_size, rim)
         seen = self._look(depth, room, accuracy, placed)
-        along = min(MAX_PATCHES, int(cell_size / (LEAST_PIXELS * pixel)))
+        along = min(MAX_PATCHES, int(cell_size / (MIN_PIXELS * pixel)))
         return read_tote(seen, room, self._wall(), accuracy, cell.tote_size[:2], along)
 
     def items(

@@ -17,13 +17,13 @@ from scipy import ndimage
 from pickplace.common.validate import refuse_if
 from pickplace.robot.box import Box, DepthMapError
 
-MOST_MISSING_PIXELS = 0.12  # greatest share of the pixels of level surfaces that may lack a depth
+MAX_MISSING_SHARE = 0.12  # greatest share of the pixels of level surfaces that may lack a depth
 SEAM = 5  # longest gap in a level top that is filled, pixels; a longer one may part two items
 MARGIN = 24  # width of the border around the room that is read, too, pixels
 HOLE = np.ones((4, 4), dtype=bool)  # the smallest hole, pixels
 HOLE[::3, ::3] = False
 SQUARE = 1.25  # side of the squares of a seen surface, pixels
-AROUND = np.ones((3, 3), dtype=bool)
+EIGHT_NEIGHBOURS = np.ones((3, 3), dtype=bool)
 RECORD_MARGIN = 0.008  # greatest distance of an item in the tote from its recorded place, m
 
 
@@ -54,7 +54,7 @@ class Heights:
     lowest: np.ndarray  # the least height that a pixel may have; NaN in holes
     holes: np.ndarray  # bool: pixels of holes
 
-    def at(self, height) -> np.ndarray:
+    def points_at_height(self, height) -> np.ndarray:
         """Return the point where each pixel's ray passes a height, one for all or one each, ``[rows, columns, 2]``."""
         way = (height - self.origin[2]) / self.rays[..., 2]
         return np.stack([self.origin[axis] + self.rays[..., axis] * way for axis in (0, 1)], -1)
@@ -62,7 +62,7 @@ class Heights:
     @cached_property
     def points(self) -> np.ndarray:
         """The place that each pixel shows, ``[rows, columns, 2]``; NaN if unknown."""
-        return self.at(self.height)
+        return self.points_at_height(self.height)
 
     def surface(self, room: Room) -> np.ndarray:
         """Return the greatest height that is seen in each square of :data:`SQUARE` pixels, -inf where none is seen."""
@@ -84,7 +84,7 @@ class Heights:
             surface: see :meth:`surface`.
             where: bool: the pixels to consider; the others show no such thing.
         """
-        points = self.at(height)
+        points = self.points_at_height(height)
         inside = self.holes & where & (distance_outside(points, room) < 0)
         seen = surface[tuple((points[inside] / (SQUARE * self.pixel)).astype(int).T)]
         inside[inside] = np.isinf(seen) | (np.abs(seen - height) <= level_range(accuracy))
@@ -145,12 +145,12 @@ def read_heights(
     low = -_greatest_beside(np.where(unknown, -np.inf, np.where(is_recorded, 0.0, -height)), gaps)
     level = gaps & (high - low <= level_range(accuracy))
     seen = Heights(origin, rays, (rows.start, columns.start), pixel, raw, height, height, height, holes)
-    shown = distance_outside(seen.at(0.0), room) < 0
+    shown = distance_outside(seen.points_at_height(0.0), room) < 0
     missing = (level & shown).sum() / max(1, ((level | known) & shown).sum())
     refuse_if(
-        missing > MOST_MISSING_PIXELS,
+        missing > MAX_MISSING_SHARE,
         f"depth: {missing:.0%} of the pixels on level surfaces in the {room.name} have no depth, expected "
-        f"{MOST_MISSING_PIXELS:.0%} at most: take another image.",
+        f"{MAX_MISSING_SHARE:.0%} at most: take another image.",
         DepthMapError,
     )
     single = level & _is_short(gaps)
@@ -244,6 +244,6 @@ def _greatest_beside(heights: np.ndarray, gaps: np.ndarray) -> np.ndarray:
 
 def _is_short(gaps: np.ndarray) -> np.ndarray:
     """Return a mask of the single gaps: at most :data:`SEAM` pixels long, so they do not part two items; bool."""
-    numbers, _ = ndimage.label(gaps, AROUND)
+    numbers, _ = ndimage.label(gaps, EIGHT_NEIGHBOURS)
     short = [False, *(max(side.stop - side.start for side in part) <= SEAM for part in ndimage.find_objects(numbers))]
     return np.array(short)[numbers]

@@ -23,7 +23,7 @@ MAX_PATCHES = 8  # greatest number of patches along a cell; finer maps are reduc
 MAX_LABEL = 2**31 - 1
 LABEL_HINT = "; of several items give bin_labels, too"
 #: Width of an item's border, as a share of its side, if the item counts as parallel to the walls: sine of a degree.
-SNAPPED = 0.02
+PARALLEL_TOLERANCE = 0.02
 
 
 class ToteMap(NamedTuple):
@@ -196,7 +196,7 @@ def rectangle(w: float, d: float, yaw: float) -> np.ndarray:
     return np.array([(-w, -d), (w, -d), (w, d), (-w, d)]) / 2 @ turned_axes(math.radians(yaw))
 
 
-def touches(centres: np.ndarray, corners: np.ndarray, box: Box) -> np.ndarray:
+def overlap_mask(centres: np.ndarray, corners: np.ndarray, box: Box) -> np.ndarray:
     """Return a mask of the centres ``[P, 2]`` at which a convex polygon overlaps a box in plan view, bool ``[P]``.
 
     Two that only touch do not overlap. Convex polygons are apart if they are apart along the normal of one side.
@@ -230,7 +230,7 @@ def refuse_stacked(boxes: list[Box], tolerance: float) -> None:
     for index, (number, box) in enumerate(seen):
         for other_number, other in seen[:index]:
             refuse_if(
-                touches(np.array([[box.x, box.y]]), rectangle(box.w, box.d, box.yaw), other).any(),
+                overlap_mask(np.array([[box.x, box.y]]), rectangle(box.w, box.d, box.yaw), other).any(),
                 f"items[{number}] overlaps items[{other_number}] in plan view; expected items that stand side by side "
                 "on the bin's floor, none on another.",
                 DepthMapError,
@@ -261,7 +261,7 @@ def box_of_map(heights: np.ndarray, side: float, accuracy: float, is_cell_map: b
     box = Box(x, y, w, d, float(heights.max()), yaw)
     # All that lies well inside the rectangle must be the item's top.
     centres = (np.indices(heights.shape).transpose(1, 2, 0) + 0.5) * side
-    border = 0.0 if is_cell_map else side + SNAPPED * max(w, d) * (yaw == 0)
+    border = 0.0 if is_cell_map else side + PARALLEL_TOLERANCE * max(w, d) * (yaw == 0)
     inside = is_inside(centres, (x, y), (w - 2 * border, d - 2 * border), yaw)
     expected = f"{box.h:g} m: one cuboid, {w:g} x {d:g} m with its centre at [{x:g}, {y:g}]{'' if name else LABEL_HINT}"
     refuse("bin_depth", inside & (heights < box.h - 2 * accuracy - ROUNDING), heights, f" m{name}", expected)

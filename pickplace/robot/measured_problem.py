@@ -22,10 +22,10 @@ from pickplace.robot.measure import (
     box_of_map,
     least_height,
     metric_map,
+    overlap_mask,
     patches,
     refuse_stacked,
     segments_of_map,
-    touches,
     turned_axes,
     whole_units,
 )
@@ -75,7 +75,7 @@ class MeasuredProblem(Problem):
     def insets(self) -> list[tuple[int, int]]:
         return [part.cell.item_inset for part in self.parts]
 
-    def is_feasible_in_an_empty_tote(self) -> bool:
+    def is_feasible_in_empty_tote(self) -> bool:
         flat = torch.zeros_like(self.tote.highest)
         empty = self.tote._replace(highest=flat, lowest=flat, bears=torch.ones_like(self.tote.bears))
         return any(
@@ -347,7 +347,7 @@ def _clear_picks(
     for other in boxes[:index] + boxes[index + 1 :]:
         if other.h + accuracy >= box.h - accuracy - ROUNDING:
             wider = replace(other, w=other.w + 2 * clearance, d=other.d + 2 * clearance)
-            clear &= ~np.any([touches(centres, part, wider) for part in body], axis=0)
+            clear &= ~np.any([overlap_mask(centres, part, wider) for part in body], axis=0)
     return clear
 
 

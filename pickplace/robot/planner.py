@@ -330,7 +330,7 @@ def _decide(
 ) -> tuple[str, Tensor | None, Ranking | None]:
     """Return the status, the action if one is feasible, and the policy's ranking if a policy was asked; else None."""
     if not footprint_mask(problem.cell, problem.maps).any():
-        return "stuck" if problem.is_feasible_in_an_empty_tote() else "impossible", None, None
+        return "stuck" if problem.is_feasible_in_empty_tote() else "impossible", None, None
     cell, ranking = problem.cell, None
 
     def choose(seen: Observation) -> Tensor:

@@ -70,7 +70,7 @@ class Problem(ABC):
     release: float = 0.0  # height of the suction face above the item's planned top when it lets go
 
     @abstractmethod
-    def is_feasible_in_an_empty_tote(self) -> bool:
+    def is_feasible_in_empty_tote(self) -> bool:
         """Return whether any action would succeed in an empty tote."""
 
     @abstractmethod
@@ -135,7 +135,7 @@ class GridProblem(Problem):
 
     facts: FailureMaps
 
-    def is_feasible_in_an_empty_tote(self) -> bool:
+    def is_feasible_in_empty_tote(self) -> bool:
         empty = self.state._replace(surface=torch.full_like(self.state.surface, EMPTY))
         return bool(footprint_mask(self.cell, placing_maps(self.cell, empty)).any())
 

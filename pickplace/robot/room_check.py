@@ -5,13 +5,13 @@ from scipy import ndimage
 
 from pickplace.common.validate import refuse_if
 from pickplace.robot.box import DepthMapError
-from pickplace.robot.depth_image import AROUND, Heights, Room, distance_outside, level_range
+from pickplace.robot.depth_image import EIGHT_NEIGHBOURS, Heights, Room, distance_outside, level_range
 
-FEW = 12  # number of pixels that may be wrong
-LEAST_FLOOR = 0.02  # least share of the seen pixels on the floor; with less, the rim is checked instead
-LEAST_RIM = 0.25  # least share of the rim, taken as a pixel wide, that must be seen then
-MOST_BELOW = 0.01  # greatest share of the seen pixels that may be below the floor
-MOST_OPEN = 0.2  # greatest share of a wall that may be open
+MAX_WRONG_PIXELS = 12  # number of pixels that may be wrong
+MIN_FLOOR = 0.02  # least share of the seen pixels on the floor; with less, the rim is checked instead
+MIN_RIM = 0.25  # least share of the rim, taken as a pixel wide, that must be seen then
+MAX_SHARE_BELOW = 0.01  # greatest share of the seen pixels that may be below the floor
+MAX_OPEN_SHARE = 0.2  # greatest share of a wall that may be open
 RIM_WIDTH = 0.015  # width of the strip of the rim that is checked, m
 HINT = "check the camera's pose, its calibration, and that this is the image of the {}"
 
@@ -30,14 +30,14 @@ def check_room(seen: Heights, room: Room, accuracy: float, margin: float) -> Non
     _check_walls(seen, room)
     below = within & (seen.height < -band)
     refuse_if(
-        below.sum() > max(FEW, MOST_BELOW * within.sum()),
+        below.sum() > max(MAX_WRONG_PIXELS, MAX_SHARE_BELOW * within.sum()),
         f"depth: {below.sum() / max(1, within.sum()):.0%} of what is seen in the {room.name} lies below its floor, at "
         f"{float(np.median(seen.height[below])) if below.any() else 0:.3f} m, expected 0 m: {HINT.format(room.name)}.",
         DepthMapError,
     )
     at_floor = np.abs(np.nan_to_num(seen.height, nan=np.inf)) <= band
-    floor = within & ndimage.binary_erosion(at_floor, AROUND)  # not the feet of items
-    if floor.sum() >= max(FEW, LEAST_FLOOR * within.sum()):
+    floor = within & ndimage.binary_erosion(at_floor, EIGHT_NEIGHBOURS)  # not the feet of items
+    if floor.sum() >= max(MAX_WRONG_PIXELS, MIN_FLOOR * within.sum()):
         _check_level(seen, room, floor, accuracy)
         _check_size(seen, room, floor, band, accuracy)
     else:
@@ -81,10 +81,10 @@ def _check_size(seen: Heights, room: Room, floor: np.ndarray, band: float, accur
     raw = np.nan_to_num(seen.raw, nan=np.inf)
     parts, _ = ndimage.label(np.abs(raw) <= band)  # the median filter would remove a thin wall
     joined = np.isin(parts, np.unique(parts[floor & (parts > 0)])) & (parts > 0)
-    outside = distance_outside(seen.at(np.where(joined, raw, 0.0)), room)
+    outside = distance_outside(seen.points_at_height(np.where(joined, raw, 0.0)), room)
     beyond = joined & (outside > max(2 * seen.pixel, accuracy))
     refuse_if(
-        beyond.sum() > FEW,
+        beyond.sum() > MAX_WRONG_PIXELS,
         f"depth: the floor of the {room.name} goes on {float(outside[beyond].max(initial=0.0)):.3f} m beyond its "
         f"walls, expected {room.sides[0]:g} x {room.sides[1]:g} m: {HINT.format(room.name)}.",
         DepthMapError,
@@ -100,7 +100,7 @@ def _check_walls(seen: Heights, room: Room) -> None:
             ways.append(np.where(ray == 0, np.inf, (np.where(ray > 0, length, 0.0) - seen.origin[axis]) / ray))
     side, first = ways[1] < ways[0], np.minimum(*ways)
     leaves = np.where(np.isfinite(first), seen.origin[2] + first * seen.rays[..., 2], 0.0)
-    at_wall = distance_outside(seen.at(leaves), room) < 1e-6
+    at_wall = distance_outside(seen.points_at_height(leaves), room) < 1e-6
     known = ~np.isnan(seen.raw) & at_wall & (first > 0)
     known &= (leaves > max(0.03, 0.3 * room.rim)) & (leaves < 0.9 * room.rim)
     for axis in (0, 1):
@@ -108,7 +108,7 @@ def _check_walls(seen: Heights, room: Room) -> None:
             wall = known & (side == axis) & ((seen.rays[..., axis] > 0) == way_up)
             through = wall & (seen.raw < leaves / 4)
             refuse_if(
-                through.sum() > max(FEW, MOST_OPEN * wall.sum()),
+                through.sum() > max(MAX_WRONG_PIXELS, MAX_OPEN_SHARE * wall.sum()),
                 f"depth: no wall of the {room.name} is seen at {'xy'[axis]}={room.sides[axis] * way_up:g} m, expected "
                 f"one that is {room.rim:g} m high: {HINT.format(room.name)}.",
                 DepthMapError,
@@ -118,12 +118,12 @@ def _check_walls(seen: Heights, room: Room) -> None:
 def _refuse_over_wall(seen: Heights, room: Room, band: float) -> None:
     """Refuse a thing, such as an arm, that is seen above the rim on both sides of a wall's inner face."""
     outside = distance_outside(seen.points, room)
-    parts, count = ndimage.label(seen.height > room.rim + band, AROUND)
+    parts, count = ndimage.label(seen.height > room.rim + band, EIGHT_NEIGHBOURS)
     beyond = parts * ((outside > 1.5 * seen.pixel) & (outside < 1.5 * seen.pixel + 0.006))
     within = parts * (outside < -1.5 * seen.pixel)
     for number in range(1, count + 1):
         refuse_if(
-            min((beyond == number).sum(), (within == number).sum()) > FEW,
+            min((beyond == number).sum(), (within == number).sum()) > MAX_WRONG_PIXELS,
             f"depth: something {float(np.median(seen.height[parts == number])):.3f} m high reaches over a wall of the "
             f"{room.name}, whose rim is at {room.rim:g} m; expected nothing there: is a hand or a tool in the way?",
             DepthMapError,
@@ -136,7 +136,7 @@ def _check_rim(seen: Heights, room: Room, band: float, accuracy: float) -> None:
     rim = (outside > 0) & (outside < RIM_WIDTH) & (np.abs(seen.height - room.rim) <= band)
     height = float(np.median(seen.height[rim])) if rim.any() else 0.0
     refuse_if(
-        rim.sum() < LEAST_RIM * 2 * sum(room.sides) / seen.pixel or abs(height - room.rim) > accuracy,
+        rim.sum() < MIN_RIM * 2 * sum(room.sides) / seen.pixel or abs(height - room.rim) > accuracy,
         f"depth: neither the floor of the {room.name} is seen at 0 m, nor its rim at {room.rim:g} m: "
         f"{HINT.format(room.name)}.",
         DepthMapError,

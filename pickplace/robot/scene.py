@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
-from pickplace.common.validate import at_most, excerpt, integral_number, is_number, number, one_of, refuse_if
+from pickplace.common.validate import excerpt, integral_number, is_number, number, one_of, refuse_above, refuse_if
 from pickplace.robot.box import ACCURACY, CLEARANCE, MILLIMETRE, Box, DepthMapError, EmptyBinError, UnknownBox
 from pickplace.robot.camera import Camera
 from pickplace.robot.measure import ToteMap
@@ -14,7 +14,7 @@ from pickplace.rules.maps import FAR
 CLEARANCE_PIXELS = 2  # least clearance around an item that a camera sees, in pixels
 MAX_VALUE = 1e3  # greatest coordinate of a box, m, its greatest yaw, degrees, and mass, kg
 #: Least values of a box's fields: lengths in metres, masses in kilograms.
-LEAST = {
+MIN_FIELD_VALUES = {
     **dict.fromkeys("wdh", (MILLIMETRE, "a length", "m")), "edge_error": (0.0, "a length", "m"),
     "mass": (0.0, "a mass", "kg"), "max_load": (0.0, "a mass", "kg"),
 }  # fmt: skip
@@ -95,7 +95,7 @@ class Scene:
         if self.coming is not None:
             refuse_if(self.cell_size is None, "coming: the lengths are whole cells; expected a scene in metres.")
             _check_boxes("coming", self.coming)
-            at_most("coming: the list has", len(self.coming), "boxes", MAX_BIN_ITEMS)
+            refuse_above("coming: the list has", len(self.coming), "boxes", MAX_BIN_ITEMS)
         if isinstance(self.items, BinMap):
             return
         _check_boxes("items", self.items)
@@ -139,8 +139,8 @@ class Scene:
             EmptyBinError: if the bin is seen, and nothing lies in it.
             DepthMapError: for an image that allows no plan; another image may do.
         """
-        (over_bin, bin_image), (over_tote, tote_image) = bin_view, tote_view
-        pixel, clearance = max(over_bin.pixel(), over_tote.pixel()), settings.get("clearance", CLEARANCE)
+        (over_bin, bin_image), (effector_over_tote, tote_image) = bin_view, tote_view
+        pixel, clearance = max(over_bin.pixel(), effector_over_tote.pixel()), settings.get("clearance", CLEARANCE)
         number("clearance", clearance, 0, 0.1, "metres")
         refuse_if(
             clearance < CLEARANCE_PIXELS * pixel - 1e-9,
@@ -150,7 +150,7 @@ class Scene:
         greatest = tote_height if greatest_height is None else greatest_height
         return cls(
             over_bin.items(bin_image, cell, cell_size, labels, accuracy, sizes, greatest, bin_height),
-            over_tote.tote_map(tote_image, cell, cell_size, tote_height, accuracy, placed),
+            effector_over_tote.tote_map(tote_image, cell, cell_size, tote_height, accuracy, placed),
             cell_size, accuracy, tote_height=tote_height, bin_height=bin_height, placed=placed, **settings,
         )  # fmt: skip
 
@@ -183,7 +183,7 @@ def _check_boxes(key: str, boxes: Any) -> None:
     )
     for at, box in enumerate(boxes):
         for name in (field.name for field in fields(Box)):
-            value, (least, what, unit) = getattr(box, name), LEAST.get(name, (-MAX_VALUE, "", ""))
+            value, (least, what, unit) = getattr(box, name), MIN_FIELD_VALUES.get(name, (-MAX_VALUE, "", ""))
             expected = f"{what} of at least {least:g} {unit}" if unit else "a finite number"
             good = is_number(value) and least <= value <= MAX_VALUE or (name == "max_load" and value is None)
             refuse_if(not good, f"{key}[{at}].{name}={excerpt(value)}: expected {expected}.", DepthMapError)

@@ -8,11 +8,11 @@ from scipy import ndimage
 
 from pickplace.common.validate import refuse_if
 from pickplace.robot.box import DepthMapError
-from pickplace.robot.depth_image import AROUND, Heights, Room, distance_outside, level_range
+from pickplace.robot.depth_image import EIGHT_NEIGHBOURS, Heights, Room, distance_outside, level_range
 from pickplace.robot.measure import ToteMap
-from pickplace.robot.room_check import FEW
+from pickplace.robot.room_check import MAX_WRONG_PIXELS
 
-MOST_UNSEEN = 0.25  # greatest share of a tote that may be unseen
+MAX_UNSEEN_SHARE = 0.25  # greatest share of a tote that may be unseen
 THICKEST = 0.02  # greatest thickness of the walls, m
 NARROWEST = 0.02  # least width of a hand or a tool, m
 
@@ -29,10 +29,10 @@ def read_tote(seen: Heights, room: Room, margin: float, accuracy: float, grid: S
     Raises:
         DepthMapError: for something above the rim, or too much that is not seen.
     """
-    within = distance_outside(seen.at(seen.highest), room) < -margin
+    within = distance_outside(seen.points_at_height(seen.highest), room) < -margin
     over = within & (seen.height > room.rim + level_range(accuracy))
     refuse_if(
-        over.sum() > FEW,
+        over.sum() > MAX_WRONG_PIXELS,
         f"depth: something {float(np.median(seen.height[over])) if over.any() else 0:.3f} m high is seen in the tote, "
         f"expected up to {room.rim:g} m, its rim: is a hand or a tool in the way?",
         DepthMapError,
@@ -42,8 +42,8 @@ def read_tote(seen: Heights, room: Room, margin: float, accuracy: float, grid: S
     lowest_seen = np.where(seen.holes, 0.0, np.nan_to_num(seen.lowest, nan=np.inf))
     highest, lowest = _patch_heights(seen, room, margin, shape, seen.highest, lowest_seen)
     refuse_if(
-        (share := float((unknown | np.isinf(highest)).mean())) > MOST_UNSEEN,
-        f"depth: {share:.0%} of the tote are not seen, expected {MOST_UNSEEN:.0%} at most.",
+        (share := float((unknown | np.isinf(highest)).mean())) > MAX_UNSEEN_SHARE,
+        f"depth: {share:.0%} of the tote are not seen, expected {MAX_UNSEEN_SHARE:.0%} at most.",
         DepthMapError,
     )
     _check_rim(seen, room)
@@ -54,9 +54,9 @@ def read_tote(seen: Heights, room: Room, margin: float, accuracy: float, grid: S
     edge = math.ceil(margin * shape[0] / room.sides[0])
     border[edge:-edge, edge:-edge] = False
     unseen = np.isinf(highest)
-    hidden, count = ndimage.label(unseen & ~border, AROUND)
+    hidden, count = ndimage.label(unseen & ~border, EIGHT_NEIGHBOURS)
     for part in (hidden == number for number in range(1, count + 1)):
-        around = ndimage.binary_dilation(part, AROUND) & ~unseen
+        around = ndimage.binary_dilation(part, EIGHT_NEIGHBOURS) & ~unseen
         highest[part] = highest[around].max(initial=0.0 if around.any() else room.rim)
     return ToteMap(
         _nearest(highest, np.isinf(highest)).clip(0, None),
@@ -75,8 +75,8 @@ def _check_rim(seen: Heights, room: Room) -> None:
         return
     pixel = seen.pixel * (1 - room.rim / seen.origin[2])
     side = 2 * math.ceil(NARROWEST / pixel / 2) - 1
-    wide, _ = ndimage.label(ndimage.maximum_filter(ndimage.minimum_filter(seen.holes, side), side), AROUND)
-    beyond = distance_outside(seen.at(room.rim), room)
+    wide, _ = ndimage.label(ndimage.maximum_filter(ndimage.minimum_filter(seen.holes, side), side), EIGHT_NEIGHBOURS)
+    beyond = distance_outside(seen.points_at_height(room.rim), room)
     over = np.intersect1d(wide[beyond < 0], wide[beyond > THICKEST])
     refuse_if(
         over.any(),
@@ -102,7 +102,7 @@ def _patch_heights(
     greatest, least = np.full(shape, -np.inf), np.full(shape, np.inf)
     for places, is_own in ((highest, True), (np.where(np.isinf(high), np.nan, high), False)):
         # A pixel beside a higher one also stands for the place at that height.
-        points = seen.at(places)
+        points = seen.points_at_height(places)
         within = distance_outside(points, room) < -margin
         at = tuple((points[within] / (room.sides[0] / shape[0])).astype(int).clip(0, shape - 1).T)
         np.maximum.at(greatest, at, high[within])
@@ -136,7 +136,7 @@ def _behind_holes(seen: Heights, room: Room, margin: float, accuracy: float, sha
     for level in np.unique(np.round(seen.height[seen.is_within(room, margin)] / step)) * step:
         if not (holes := seen.holes_above(level, surface, room, accuracy)).any():
             continue
-        rays = seen.rays[ndimage.binary_dilation(holes, AROUND)]
+        rays = seen.rays[ndimage.binary_dilation(holes, EIGHT_NEIGHBOURS)]
         for height in np.linspace(level, max(level, room.rim), math.ceil(shift / (patch / 2)) + 2):
             points = seen.origin[:2] + rays[:, :2] * ((height - seen.origin[2]) / rays[:, 2])[:, None]
             index = np.floor(points / patch).astype(int)

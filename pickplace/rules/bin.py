@@ -10,11 +10,11 @@ from functools import reduce
 import torch
 from torch import Tensor
 
-from pickplace.common.recording import any_of
+from pickplace.common.capture import any_of
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import split_action
 from pickplace.rules.item import Item
-from pickplace.rules.state import REFILLS, Episode, State
+from pickplace.rules.state import REFILLS, EpisodeSettings, State
 
 
 def blocked_picks(cell: CellSpec, items: Item) -> Tensor | None:
@@ -107,7 +107,7 @@ def remove_item(cell: CellSpec, items: Item, number: Tensor, removed: Tensor | N
     return Item.from_table(longer.gather(1, after[..., None].expand_as(table)))
 
 
-def must_share(items: Item, rows: Tensor) -> bool:
+def has_occupied_bins(items: Item, rows: Tensor) -> bool:
     """Return whether any of the bins in ``rows``, bool ``[N]``, already holds an item, or may. All must have room."""
     return items.x.shape[1] > 1 and any_of(rows & items.exists[:, 0])
 
@@ -153,7 +153,7 @@ def find_room(cell: CellSpec, item: Item, others: Item, keeps_place: Tensor, uni
     return item._replace(x=place // bin_d, y=place % bin_d).map(lambda part: torch.where(found, part, 0))
 
 
-def may_arrive(cell: CellSpec, items: Item, settings: Episode) -> Tensor:
+def may_arrive(cell: CellSpec, items: Item, settings: EpisodeSettings) -> Tensor:
     """Return whether items may arrive in the bins ``[N, M]`` now, bool ``[N]``; a batch only in empty bins.
 
     Args:
@@ -165,13 +165,13 @@ def may_arrive(cell: CellSpec, items: Item, settings: Episode) -> Tensor:
     return ~(items.exists[:, 0] & waits)
 
 
-def is_below_limit(items: Item, settings: Episode) -> Tensor:
+def is_below_limit(items: Item, settings: EpisodeSettings) -> Tensor:
     """Return whether the bins ``[N, M]`` hold fewer items than they may, bool ``[N]``."""
     below = ~items.exists[:, -1]
     return below if settings.bin_items is None else below & (items.exists.sum(1) < settings.bin_items)
 
 
-def let_in(cell: CellSpec, state: State) -> tuple[State, Tensor]:
+def admit_coming_items(cell: CellSpec, state: State) -> tuple[State, Tensor]:
     """Return the state after the items of the preview have arrived, as far as the bins have room, and the bins in
     which an item that is not seen yet arrives next, bool ``[N]``.
 
@@ -186,7 +186,7 @@ def let_in(cell: CellSpec, state: State) -> tuple[State, Tensor]:
     for _ in range(items.x.shape[1]):
         open_ = open_ & is_below_limit(items, settings)
         item = select_item(coming, first)
-        if must_share(items, open_):
+        if has_occupied_bins(items, open_):
             item = find_room(cell, item, items, ~items.exists[:, 0], first.double())
         open_ = open_ & item.exists
         if not any_of(open_):

@@ -6,13 +6,13 @@ from inspect import signature
 from typing import ClassVar
 
 from pickplace.common.validate import (
-    at_most,
     expect,
     flag,
     is_whole,
     number,
     one_of,
     or_null,
+    refuse_above,
     short_text,
     size_tuple,
     whole_number,
@@ -130,9 +130,9 @@ class CellSpec:
         expect(isinstance(self.reach, Reach | None), "reach", self.reach, "a Reach, such as an Annulus, or None")
         # Each size is valid alone, but their products may exceed the memory.
         bin_size, tote_size = f"bin_size={[*self.bin_size]}", f"tote_size={[*self.tote_size]}"
-        at_most(f"{bin_size}: the bin has", self.num_picks, "cells", MAX_CELLS)
-        at_most(f"{tote_size}: the tote has", self.num_places, "cells", MAX_CELLS)
-        at_most(f"{bin_size}, {tote_size}: the cell has", self.num_actions, "actions", self.max_actions)
+        refuse_above(f"{bin_size}: the bin has", self.num_picks, "cells", MAX_CELLS)
+        refuse_above(f"{tote_size}: the tote has", self.num_places, "cells", MAX_CELLS)
+        refuse_above(f"{bin_size}, {tote_size}: the cell has", self.num_actions, "actions", self.max_actions)
         if self.limits is not None:
             self.limits.check(self)
 

@@ -35,19 +35,19 @@ class Resting(NamedTuple):
     borne: Tensor | None = None  # whether the items below bear the load; None: any item bears any load
 
 
-class Over(NamedTuple):
+class EffectorOverTote(NamedTuple):
     """The end effector over places in the tote."""
 
-    leaves: Tensor  # whether it leaves the tote
+    leaves_tote: Tensor  # whether it leaves the tote
     rim: Tensor  # height of the tote
     obstacle: Tensor  # greatest height under it in the tote
     lowest: Tensor | None = None  # limits of the robot on the height of the suction face; None: it has none
     highest: Tensor | None = None
 
-    def at(self, index: Tensor) -> "Over":
+    def at(self, index: Tensor) -> "EffectorOverTote":
         """Return the facts at flat indices of the places."""
         limits = [part.flatten()[index] for part in (self.lowest, self.highest) if part is not None]
-        return Over(self.leaves.flatten()[index], self.rim, self.obstacle.flatten()[index], *limits)
+        return EffectorOverTote(self.leaves_tote.flatten()[index], self.rim, self.obstacle.flatten()[index], *limits)
 
 
 #: The failure, the scope, and a function of the scope's facts that returns whether the check is passed, or the height;
@@ -56,13 +56,13 @@ CHECKS: tuple[tuple[Failure, int, Callable[[Any], Tensor | None]], ...] = (
     (Failure.PICK_MISS, PICK, lambda pick: pick.grips),
     (Failure.BIN_COLLISION, PICK, lambda pick: ~pick.collides),
     (Failure.TOTE_COLLISION, FOOTPRINT, lambda resting: resting.inside),
-    (Failure.TOTE_COLLISION, LEAST_TOP, lambda over: torch.where(over.leaves, over.rim, NEVER)),
+    (Failure.TOTE_COLLISION, LEAST_TOP, lambda effector: torch.where(effector.leaves_tote, effector.rim, NEVER)),
     (Failure.OVERFLOW, FOOTPRINT, lambda resting: resting.top <= resting.rim),
-    (Failure.ITEM_COLLISION, LEAST_TOP, lambda over: over.obstacle),
+    (Failure.ITEM_COLLISION, LEAST_TOP, lambda effector: effector.obstacle),
     (Failure.UNSTABLE, FOOTPRINT, lambda resting: resting.stable),
     (Failure.OUT_OF_REACH, PICK, lambda pick: pick.reachable),
-    (Failure.OUT_OF_REACH, LEAST_TOP, lambda over: over.lowest),
-    (Failure.OUT_OF_REACH, GREATEST_TOP, lambda over: over.highest),
+    (Failure.OUT_OF_REACH, LEAST_TOP, lambda effector: effector.lowest),
+    (Failure.OUT_OF_REACH, GREATEST_TOP, lambda effector: effector.highest),
     (Failure.FORBIDDEN_TURN, TURN, lambda allowed: allowed),
     (Failure.OVERLOADED, FOOTPRINT, lambda resting: resting.borne),
 )
@@ -79,13 +79,13 @@ def combine(scope: int, facts: Any) -> Any:
     return reduce(_COMBINE[scope], values) if values else None
 
 
-def first_failure(pick: Any, resting: Resting, over: Over, turn: Tensor | None = None) -> Tensor:
+def first_failure(pick: Any, resting: Resting, effector: EffectorOverTote, turn: Tensor | None = None) -> Tensor:
     """Return the failure code of the first check that each action does not pass, int64; 0 if it passes all.
 
     ``turn`` is whether the action's rotation is allowed; None: all are.
     """
     failure = torch.zeros_like(resting.top)
-    facts = {PICK: pick, FOOTPRINT: resting, LEAST_TOP: over, GREATEST_TOP: over, TURN: turn}
+    facts = {PICK: pick, FOOTPRINT: resting, LEAST_TOP: effector, GREATEST_TOP: effector, TURN: turn}
     for kind, scope, find in reversed(CHECKS):  # so that the first failed check is written last
         if (value := find(facts[scope])) is not None:
             passed = _COMPARE[scope](resting.top, value) if scope in _COMPARE else value

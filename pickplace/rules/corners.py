@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from pickplace.common.recording import any_of
+from pickplace.common.capture import any_of
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.maps import FAR
 from pickplace.rules.masks import PlacingMaps, footprint_mask

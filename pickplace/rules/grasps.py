@@ -24,7 +24,7 @@ def is_outside(corner: Tensor, side: Tensor | int, grid: int) -> Tensor:
     return (corner < 0) | (corner > grid - side)
 
 
-def turn(near_x: Tensor, near_y: Tensor, back_x: Tensor, back_y: Tensor) -> tuple[tuple[Tensor, Tensor], ...]:
+def turned_offsets(near_x: Tensor, near_y: Tensor, back_x: Tensor, back_y: Tensor) -> tuple[tuple[Tensor, Tensor], ...]:
     """Return the item's offset ``(x, y)`` under the end effector for each rotation ``0..3``.
 
     | rotation | x, y |
@@ -81,7 +81,7 @@ def grasp(cell: CellSpec, item: Item, x: Tensor, y: Tensor, blocked: Tensor | No
     if blocked is not None:
         collides = collides | blocked.t().gather(0, pick.reshape(-1, pick.shape[-1])).view_as(pick)
     if cell.limits is not None:
-        reachable = cell.limits.on(pick.device).allow_pick(pick, item.h)
+        reachable = cell.limits.to(pick.device).allow_pick(pick, item.h)
     return Grasp(gripped & item.exists, collides, reachable, near_x, near_y, back_x, back_y)
 
 
@@ -99,7 +99,9 @@ def carry(
     (ee_w, ee_d), (x_bin, y_bin, x_tote, y_tote, rotation) = cell.gripper.size, split_action(cell, action)
     quarter_turned = rotation % 2 == 1
     picked = grasp(cell, item, x_bin, y_bin, blocked)
-    turned = zip(*turn(picked.near_x, picked.near_y, picked.back_x, picked.back_y)[: cell.rotations], strict=True)
+    turned = zip(
+        *turned_offsets(picked.near_x, picked.near_y, picked.back_x, picked.back_y)[: cell.rotations], strict=True
+    )
     offset_x, offset_y = (torch.stack(offsets).gather(0, rotation[None])[0] for offsets in turned)
     w, d = turned_size(item, quarter_turned)
     wide, deep = torch.where(quarter_turned, ee_d, ee_w), torch.where(quarter_turned, ee_w, ee_d)
@@ -160,7 +162,7 @@ def all_grasps(cell: CellSpec, item: Item, blocked: Tensor | None = None) -> tup
     """
     x, y = (torch.arange(side, device=item.x.device)[:, None] for side in cell.bin_size[:2])
     found = grasp(cell, item, x[:, None], y, blocked)  # [W_B, D_B, N]
-    pairs = turn(found.near_x, found.near_y, found.back_x, found.back_y)[: cell.rotations]
+    pairs = turned_offsets(found.near_x, found.near_y, found.back_x, found.back_y)[: cell.rotations]
     offset = torch.stack([torch.stack(torch.broadcast_tensors(*pair), -1) for pair in pairs], 3)  # [..., N, R, 2]
     return found.succeeds.flatten(0, 1).t(), offset.flatten(0, 1).transpose(0, 1)
 
@@ -250,7 +252,9 @@ def available_offsets(cell: CellSpec, item: Item, blocked: Tensor | None = None)
     turns = num_turns(cell)
     turned = [
         class_index(cell, rotation % turns, step_x, step_y).expand(count, count, len(item.x))
-        for rotation, (step_x, step_y) in enumerate(turn(here[:, None], here, back_x, back_y)[: cell.rotations])
+        for rotation, (step_x, step_y) in enumerate(
+            turned_offsets(here[:, None], here, back_x, back_y)[: cell.rotations]
+        )
     ]
     return (found.succeeds & in_bin).flatten(0, 1), torch.stack(turned).flatten(1, 2)
 

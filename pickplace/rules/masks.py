@@ -17,11 +17,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.common.recording import is_recording
+from pickplace.common.capture import is_capturing
 from pickplace.common.validate import check_bytes
 from pickplace.rules.bin import blocked_picks
 from pickplace.rules.cell import CellSpec
-from pickplace.rules.checks import GREATEST_TOP, LEAST_TOP, TURN, Over, combine
+from pickplace.rules.checks import GREATEST_TOP, LEAST_TOP, TURN, EffectorOverTote, combine
 from pickplace.rules.grasps import (
     all_grasps,
     available_offsets,
@@ -36,7 +36,7 @@ from pickplace.rules.grasps import (
 from pickplace.rules.gripper.base import EffectorShape
 from pickplace.rules.item import Item, flags_from_turns
 from pickplace.rules.maps import FAR, NEVER, surround, windows
-from pickplace.rules.placing import over_tote, resting_top
+from pickplace.rules.placing import effector_over_tote, resting_top
 from pickplace.rules.state import State
 
 CLASS_BYTES = 2**26  # of the masks of grasp classes that are counted at once
@@ -59,12 +59,14 @@ class PlacingMaps(NamedTuple):
     level_step: int = 0  # greatest difference of heights on a level surface; above 0 if measured
 
     @classmethod
-    def of(cls, top: Tensor, rest: Tensor, over: Over, item: Item, blocked: Tensor | None) -> "PlacingMaps":
-        """Return the maps of items; ``over`` has the end effector over every place cell, for each bin's tote."""
-        bins, count = over.obstacle.shape[-1], len(top) // over.obstacle.shape[-1]
+    def of(
+        cls, top: Tensor, rest: Tensor, effector: EffectorOverTote, item: Item, blocked: Tensor | None
+    ) -> "PlacingMaps":
+        """Return the maps of items; ``effector`` has the end effector over every place cell, for each bin's tote."""
+        bins, count = effector.obstacle.shape[-1], len(top) // effector.obstacle.shape[-1]
         bounds = []
         for scope in (LEAST_TOP, GREATEST_TOP):
-            if (bound := combine(scope, over)) is not None:
+            if (bound := combine(scope, effector)) is not None:
                 bound = bound.permute(3, 0, 1, 2).expand(bins, -1, -1, -1)
             bounds.append(bound if count == 1 or bound is None else bound.repeat_interleave(count, 0))
         return cls(top, bounds[0], item, rest, blocked, count, bounds[1])
@@ -119,9 +121,9 @@ def placing_maps(
             and below the rim.
     """
     surface, tote_height, item = state.each_item()
-    over = over_tote(cell, state.surface, state.tote_height)
+    effector = effector_over_tote(cell, state.surface, state.tote_height)
     top, rest = find_top(cell, surface, tote_height, item, state.capacity)
-    maps = PlacingMaps.of(top, rest, over, item, blocked_picks(cell, state.items))
+    maps = PlacingMaps.of(top, rest, effector, item, blocked_picks(cell, state.items))
     return maps.within_turns(cell) if cell.forbids_turns else maps
 
 
@@ -260,7 +262,7 @@ def _least_clearance(cell: CellSpec, maps: PlacingMaps, quarter_turned: int, gra
         clear, kinds = surround(maps.clearance_in(turn), margins, FAR), grasped[turn].flip(0, 1)  # in windows' order
         if (
             count > 3
-            and not is_recording()
+            and not is_capturing()
             and torch.equal(kinds, (in_x := kinds.any(1))[:, None] & (in_y := kinds.any(0)))
         ):
             # Mostly, the offsets are all pairs of an x and a y of two sets. Then reduce along x, then along y.
@@ -291,7 +293,7 @@ def _reached_within_limits(
         highest = surround(greatest_top[:, rotation].permute(1, 2, 0), margins, NEVER)
         kinds = grasped[rotation].flip(0, 1)  # in windows' order
         count = len(kinds)
-        used = product(range(count), repeat=2) if is_recording() else kinds.flatten(2).any(2).nonzero().tolist()
+        used = product(range(count), repeat=2) if is_capturing() else kinds.flatten(2).any(2).nonzero().tolist()
         for i, j in used:  # few for an item in metres: the whole cup lies on it
             here = slice(i, i + tote_w), slice(j, j + tote_d)
             reached |= (top >= clear[here]) & (top <= highest[here]) & kinds[i, j]

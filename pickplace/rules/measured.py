@@ -13,14 +13,14 @@ import torch
 from torch import Tensor
 
 from pickplace.rules.cell import CellSpec
-from pickplace.rules.checks import FOOTPRINT, Over, Resting, combine
+from pickplace.rules.checks import FOOTPRINT, EffectorOverTote, Resting, combine
 from pickplace.rules.failures import failure_codes
 from pickplace.rules.grasps import carry, split_action
 from pickplace.rules.item import Item
 from pickplace.rules.maps import FAR, NEVER
 from pickplace.rules.masks import PlacingMaps
 from pickplace.rules.measured_loads import MeasuredLoads
-from pickplace.rules.placing import OnFootprints, footprint_sizes, over_tote
+from pickplace.rules.placing import FootprintContact, effector_over_tote, footprint_sizes
 from pickplace.rules.state import State, surface_from
 from pickplace.rules.support.contact import Patches
 
@@ -63,7 +63,7 @@ class MeasuredMaps(NamedTuple):
     maps: PlacingMaps
     stable: Tensor  # bool [Q, W_T, D_T]
     highest_top: int  # greatest top that does not pass the rim
-    over: Over  # the end effector over every place cell
+    effector: EffectorOverTote  # the end effector over every place cell
     borne: Tensor | None = None  # bool [Q, W_T, D_T]: whether the items below bear the item; None: any load
 
 
@@ -82,7 +82,7 @@ def measured_maps(
         loads: loads on the items in the tote; None: they bear any.
     """
     slack = tote.accuracy
-    z = OnFootprints(cell, tote.state(cell, item).surface, *footprint_sizes(cell, item)).z[..., 0]  # [Q, W_T, D_T]
+    z = FootprintContact(cell, tote.state(cell, item).surface, *footprint_sizes(cell, item)).z[..., 0]  # [Q, W_T, D_T]
     stable = torch.stack([_is_stable(cell, tote, item, sides, turned, each) for turned, each in enumerate(z)])
     borne = None
     if loads is not None:
@@ -92,9 +92,11 @@ def measured_maps(
         borne = None if borne is None else borne.all(0).expand_as(borne)
     top, highest = z + item.h.to(z.dtype), tote.height - 2 * slack
     good = combine(FOOTPRINT, Resting(z < FAR, top, highest, stable, borne))
-    over = over_tote(cell, tote.state(cell, item, slack).surface, torch.tensor([tote.rim - 2 * slack], device=z.device))
-    maps = PlacingMaps.of(torch.where(good, top, NEVER)[None], z[None], over, item, None)
-    return MeasuredMaps(maps._replace(level_step=level_step(slack)), stable, highest, over, borne)
+    effector = effector_over_tote(
+        cell, tote.state(cell, item, slack).surface, torch.tensor([tote.rim - 2 * slack], device=z.device)
+    )
+    maps = PlacingMaps.of(torch.where(good, top, NEVER)[None], z[None], effector, item, None)
+    return MeasuredMaps(maps._replace(level_step=level_step(slack)), stable, highest, effector, borne)
 
 
 def _contact(
@@ -183,7 +185,7 @@ def _is_borne(item: Item, sides: tuple[float, float], quarter_turned: int, z: Te
     borne = torch.zeros_like(z, dtype=torch.bool)
     inside = _inside(z, footprint)
     if (z := z[inside]).numel():
-        borne[inside] = loads.bear(int(item.grams), footprint, z.long())
+        borne[inside] = loads.can_bear(int(item.grams), footprint, z.long())
     return borne
 
 
@@ -205,7 +207,7 @@ def bearing_after(
     flags = contact.supports[0, 0]
     held = torch.ones_like(flags)
     if not flags.all() and int(z) > floor_height(tote.accuracy):
-        held = contact.in_hull()
+        held = contact.hull_mask()
     # A cell bears weight if all of its patches under the item do. With one patch a cell, the item must cover it.
     bears = torch.zeros(size, dtype=torch.bool, device=flags.device)
     bears.view(-1).index_fill_(0, contact.cells, True).index_fill_(0, contact.cells[~held], False)
@@ -228,5 +230,5 @@ def failures(cell: CellSpec, measured: MeasuredMaps, action: Tensor, bin_clear: 
     picked = picked._replace(collides=~bin_clear[x_bin * cell.bin_size[1] + y_bin])
     return failure_codes(
         cell, action, item, (picked, rotation, effector, placed),
-        measured.maps.rest, measured.stable, measured.highest_top, measured.over, borne=measured.borne,
+        measured.maps.rest, measured.stable, measured.highest_top, measured.effector, borne=measured.borne,
     )  # fmt: skip

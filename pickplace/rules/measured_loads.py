@@ -48,7 +48,7 @@ class MeasuredLoads(NamedTuple):
         held = torch.where(below | torch.eye(len(tops), dtype=torch.bool, device=tops.device), spare, ANY_LOAD)
         return cls(bounds, tops, held.amin(1).clamp(min=0), unknown, step)
 
-    def bear(self, grams: int, footprint: tuple[int, int], z: Tensor) -> Tensor:
+    def can_bear(self, grams: int, footprint: tuple[int, int], z: Tensor) -> Tensor:
         """Return whether the items below bear a new item on each footprint, bool in the shape of ``z``.
 
         A surface that is neither the floor nor a known item bears nothing.

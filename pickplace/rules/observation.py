@@ -209,7 +209,7 @@ class EpisodeNumber(Term):
     """A whole number in which episodes differ, int64 ``[N, 1]``.
 
     Args:
-        key: the field of :class:`~pickplace.rules.state.Episode`.
+        key: the field of :class:`~pickplace.rules.state.EpisodeSettings`.
     """
 
     def __init__(self, key: str):

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pickplace.rules.cell import CellSpec
-from pickplace.rules.checks import FOOTPRINT, Over, Resting, combine
+from pickplace.rules.checks import FOOTPRINT, EffectorOverTote, Resting, combine
 from pickplace.rules.grasps import is_outside
 from pickplace.rules.gripper.base import EffectorShape
 from pickplace.rules.item import Item
@@ -19,7 +19,7 @@ from pickplace.rules.maps import FAR, NEVER, is_under, rectangle_sums, surround,
 from pickplace.rules.state import surface_from
 from pickplace.rules.support.contact import Contact
 
-LEAST_SIDE = 8  # side of the square under an item from which :class:`LargeItems` is faster
+MIN_SIDE = 8  # side of the square under an item from which :class:`LargeFootprintContact` is faster
 MAX_LEVELS = 2**22  # entries of its tables; further problems follow in turn
 FOOTPRINTS_AT_ONCE = {"cpu": 2**17, "cuda": 2**24}  # as many as a CPU's caches hold; 100 bytes each on a GPU
 
@@ -38,7 +38,7 @@ def resting_top(
     w, d = footprint_sizes(cell, item)
     at_once = max(1, FOOTPRINTS_AT_ONCE.get(surface.device.type, 2**24) // cell.num_footprints)
     parts = zip(surface.split(at_once), w.split(at_once, -1), d.split(at_once, -1), strict=True)
-    kind = OnFootprints if cell.max_side < LEAST_SIDE else LargeItems
+    kind = FootprintContact if cell.max_side < MIN_SIDE else LargeFootprintContact
     contacts = (kind(cell, *part) for part in parts)  # one at a time, for the memory
     found: list[tuple[Tensor, ...]]
     if capacity is None:
@@ -57,7 +57,7 @@ def unchecked_top(
     cell: CellSpec, surface: Tensor, tote_height: Tensor, item: Item, capacity: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Return the same as :func:`resting_top`, but the top of every footprint in the tote, without any check."""
-    z = OnFootprints(cell, surface, *footprint_sizes(cell, item)).z
+    z = FootprintContact(cell, surface, *footprint_sizes(cell, item)).z
     return (z + item.h.to(z.dtype)).permute(3, 0, 1, 2), z.permute(3, 0, 1, 2)
 
 
@@ -67,7 +67,7 @@ def footprint_sizes(cell: CellSpec, item: Item) -> tuple[Tensor, Tensor]:
     return sides[: cell.footprint_turns], sides.flip(0)[: cell.footprint_turns]
 
 
-class OnFootprints(Contact):
+class FootprintContact(Contact):
     """The supporting cells under an item at rest on every footprint; quantities are ``[Q, W_T, D_T, N]``.
 
     Footprints that leave the tote rest higher than any rim.
@@ -114,7 +114,7 @@ class OnFootprints(Contact):
     def under(self):  # type: ignore[override]
         return is_under(self.w, self.d, self.side)
 
-    def at_corners(self) -> Iterator[Tensor]:
+    def corner_surfaces(self) -> Iterator[Tensor]:
         wide, deep, batch = self.surface.shape
         place = torch.arange(self.padded.numel(), device=self.z.device).view(self.padded.shape)[:wide, :deep]
         along_x, along_y = ((size.clamp(1, self.side) - 1) * batch for size in (self.w, self.d))
@@ -142,7 +142,7 @@ class OnFootprints(Contact):
             yield (highest.narrow(2, x, wide) - none).clamp_(min=0).int().minimum(most)
 
 
-class LargeItems(OnFootprints):
+class LargeFootprintContact(FootprintContact):
     """The same for large items on fine grids: the work does not grow with the area of an item.
 
     Supporting cells are counted by a table of sums for each surface value in the totes.
@@ -170,7 +170,7 @@ def leaving_places(shapes: tuple[EffectorShape, ...], grid: tuple[int, int], dev
     return torch.stack(leaves)[..., None]
 
 
-def over_tote(cell: CellSpec, surface: Tensor, rim: Tensor) -> Over:
+def effector_over_tote(cell: CellSpec, surface: Tensor, rim: Tensor) -> EffectorOverTote:
     """Return the facts of the end effector over every place cell; each broadcasts to ``[T, W_T, D_T, N]``.
 
     ``T`` is the number of :attr:`~pickplace.rules.cell.CellSpec.effectors`; with limits of the robot, of rotations.
@@ -192,10 +192,10 @@ def over_tote(cell: CellSpec, surface: Tensor, rim: Tensor) -> Over:
                 under = reduce(torch.maximum, [under.narrow(axis, begin + i, grid) for i in range(size)])
             highest.append(under)
         obstacle[number] = reduce(torch.maximum, highest) >> 1
-    over = Over(leaving_places(cell.effectors, (tote_w, tote_d), device), rim.int(), obstacle)
+    effector = EffectorOverTote(leaving_places(cell.effectors, (tote_w, tote_d), device), rim.int(), obstacle)
     if cell.limits is None:
-        return over
-    turns, limits = [turn % len(cell.effectors) for turn in range(cell.rotations)], cell.limits.on(device)
+        return effector
+    turns, limits = [turn % len(cell.effectors) for turn in range(cell.rotations)], cell.limits.to(device)
     bounds = limits.lowest_top[..., None], limits.highest_top[..., None]
-    leaves, obstacle = (torch.stack([part[turn] for turn in turns]) for part in (over.leaves, obstacle))
-    return Over(leaves, over.rim, obstacle, *bounds)
+    leaves, obstacle = (torch.stack([part[turn] for turn in turns]) for part in (effector.leaves_tote, obstacle))
+    return EffectorOverTote(leaves, effector.rim, obstacle, *bounds)

@@ -48,7 +48,7 @@ class Failure(IntEnum):
         return failure
 
 
-class Episode(NamedTuple):
+class EpisodeSettings(NamedTuple):
     """The settings in which episodes may differ besides the tote height, ``[N]`` each; None if all are alike.
 
     See :attr:`~pickplace.rules.cell.CellSpec.varies`.
@@ -62,7 +62,7 @@ class Episode(NamedTuple):
     level: Tensor | None = None  # int64: number of the curriculum's level
 
     @classmethod
-    def from_observation(cls, observation: Observation) -> "Episode":
+    def from_observation(cls, observation: Observation) -> "EpisodeSettings":
         """Return the settings in the entries of an observation."""
         read = {key: observation.get(key, None) for key in ("item_mix", "bin_items", "refill", "preview", "level")}
         rotations = observation.get("rotations", None)
@@ -71,12 +71,12 @@ class Episode(NamedTuple):
             **{key: entry if entry is None else entry.reshape(-1) for key, entry in read.items()},
         )
 
-    def rows(self, index) -> "Episode":
+    def rows(self, index) -> "EpisodeSettings":
         """Return the settings of some problems, by their numbers."""
-        return Episode(*(part if part is None else part[index] for part in self))
+        return EpisodeSettings(*(part if part is None else part[index] for part in self))
 
 
-FULL_TASK = Episode()
+FULL_TASK = EpisodeSettings()
 
 
 class State(NamedTuple):
@@ -85,7 +85,7 @@ class State(NamedTuple):
     surface: Tensor  # int32 [N, W_T, D_T]: heights in the tote and bearing flags, see `surface_from`
     tote_height: Tensor  # int64 [N]: height of the episode's tote, H_T
     items: Item  # in the bin, [N, M]
-    episode: Episode = FULL_TASK  # settings in which the running episodes may differ
+    episode: EpisodeSettings = FULL_TASK  # settings in which the running episodes may differ
     pile: Pile | None = None  # the items in the tote; None: any item bears any load
     coming: Item | None = None  # items that arrive next, in their order, [N, p]; None: none are seen
 
@@ -99,7 +99,7 @@ class State(NamedTuple):
         if "pile_below" in observation:
             pile = Pile(*(observation[key] for key in ("tote_labels", "pile_spare", "pile_below")))
         coming = coming_from_observation(observation)
-        return cls(surface, tote_height, items, Episode.from_observation(observation), pile, coming)
+        return cls(surface, tote_height, items, EpisodeSettings.from_observation(observation), pile, coming)
 
     @property
     def heights(self) -> Tensor:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from pickplace.rules.bin import remove_item, select_item, take_item
 from pickplace.rules.cell import CellSpec
-from pickplace.rules.checks import Over, Resting, first_failure
+from pickplace.rules.checks import EffectorOverTote, Resting, first_failure
 from pickplace.rules.grasps import (
     carry,
     is_outside,
@@ -57,17 +57,17 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
         covered = covered[:, rotation % len(cell.effectors)]
     under = surface.flatten(1).t().gather(0, square_cells(surface.shape[1:], left, front, reach))
     highest = torch.where(covered, under, 0).amax(0) >> 1
-    over = Over(is_outside(left, wide, tote_w) | is_outside(front, deep, tote_d), tote_height, highest)
+    effector = EffectorOverTote(is_outside(left, wide, tote_w) | is_outside(front, deep, tote_d), tote_height, highest)
     if cell.limits is not None:
-        limits, place = cell.limits.on(action.device), (rotation, *split_action(cell, action)[2:4])
-        over = over._replace(lowest=limits.lowest_top[place], highest=limits.highest_top[place])
+        limits, place = cell.limits.to(action.device), (rotation, *split_action(cell, action)[2:4])
+        effector = effector._replace(lowest=limits.lowest_top[place], highest=limits.highest_top[place])
     inside = ~(is_outside(x, w, tote_w) | is_outside(y, d, tote_d))
     borne = None if pile is None else _least_capacity(pile, contact, index) >= item.grams
     resting = Resting(inside, top, tote_height, cell.support.stable(contact), borne)
     turn = (
         flags_from_turns(item.turns, cell.rotations).gather(1, rotation[:, None])[:, 0] if cell.forbids_turns else None
     )
-    failure = first_failure(picked, resting, over, turn)
+    failure = first_failure(picked, resting, effector, turn)
     height = torch.where(failure == 0, item.h, 0)
     after, pile = _add_item(cell, surface, pile, item, x, y, contact, index, height)
     return Step(after, failure, top, torch.stack([x, y, w, d], -1), item, taken, pile)
@@ -86,7 +86,7 @@ def body_cells(shapes: tuple[EffectorShape, ...], side: int, device: torch.devic
 def put_down(cell: CellSpec, state: State, choice: Tensor) -> tuple[State, Item]:
     """Return the state after a successful choice, before other items arrive, and the item that is placed, ``[N]``.
 
-    :func:`~pickplace.rules.bin.let_in` then adds the items of the preview.
+    :func:`~pickplace.rules.bin.admit_coming_items` then adds the items of the preview.
 
     Args:
         choice: int64 ``[N]``, ``item * num_footprints + footprint``, with the index of

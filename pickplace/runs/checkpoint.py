@@ -22,7 +22,7 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from pickplace.common.files import read_file, sync_folder
-from pickplace.common.validate import excerpt, expect, first_line, is_whole, refuse_any, refuse_if, reworded
+from pickplace.common.validate import excerpt, expect, first_line, is_whole, refuse_any, refuse_if, reword_errors
 from pickplace.runs.locate import FACTS, MAX_BYTES, PREVIOUS, TENSORS, CheckpointError, are_facts
 
 SCHEMA = 1
@@ -165,7 +165,7 @@ def _identity(folder: Path) -> list[tuple[int, int]] | None:
 
 def _read(folder: Path) -> tuple[dict, dict]:
     """Read a checkpoint's two files, and check schema and checksum."""
-    with reworded(
+    with reword_errors(
         (OSError, ValueError, RecursionError),  # a RecursionError from deeply nested JSON
         lambda error: CheckpointError(f"{folder}: the checkpoint cannot be read ({error})."),
     ):
@@ -182,7 +182,7 @@ def _read(folder: Path) -> tuple[dict, dict]:
         f"{folder}: {TENSORS} is truncated or altered, its checksum does not match {FACTS}.",
         CheckpointError,
     )
-    with reworded(
+    with reword_errors(
         (SafetensorError, KeyError, TypeError, ValueError, RuntimeError),  # unknown types, absurd sizes
         lambda error: CheckpointError(f"{folder}: {TENSORS} cannot be read ({first_line(error)})."),
     ):
@@ -193,7 +193,7 @@ def _read(folder: Path) -> tuple[dict, dict]:
         f"{folder}: {FACTS} lacks its state, config or frames; expected what a training wrote.",
         CheckpointError,
     )
-    with reworded(
+    with reword_errors(
         ValueError,
         lambda error: CheckpointError(f"{folder}: {FACTS} and {TENSORS} do not fit each other ({error})."),
     ):

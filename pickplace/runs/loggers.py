@@ -12,9 +12,9 @@ from numbers import Real
 from pathlib import Path
 from typing import IO, Any
 
-from pickplace.common.errors import needs_extra
+from pickplace.common.errors import require_extra
 from pickplace.common.files import read_text, replaced_file
-from pickplace.common.validate import excerpt, expect, refuse_if, reworded
+from pickplace.common.validate import excerpt, expect, refuse_if, reword_errors
 
 log = logging.getLogger(__name__)
 
@@ -64,7 +64,7 @@ class CsvLogger:
             OSError: naming the file, if it cannot be written.
         """
         row = {"frames": frames, **metrics}
-        with reworded(OSError, lambda error: OSError(error.errno, error.strerror, str(self.path))):
+        with reword_errors(OSError, lambda error: OSError(error.errno, error.strerror, str(self.path))):
             self._restore()
             if set(row) <= set(self._columns):
                 self._writer.writerow(row)
@@ -126,7 +126,7 @@ class TensorboardLogger(BackendLogger):
     """TensorBoard event files in the run folder; needs the extra ``pickplace[tensorboard]``. Args as `CsvLogger`."""
 
     def __init__(self, folder, frames: int = 0, settings: dict | None = None):
-        with needs_extra("logger", "tensorboard"):
+        with require_extra("logger", "tensorboard"):
             from torch.utils.tensorboard import SummaryWriter
         super().__init__(folder, frames)
         # purge_step: TensorBoard hides the events that came after the checkpoint of a resumed run.
@@ -156,7 +156,7 @@ class WandbLogger(BackendLogger):
         project: str = "pickplace",
         offline: bool = True,
     ):
-        with needs_extra("logger", "wandb"):
+        with require_extra("logger", "wandb"):
             import wandb  # noqa: F401
         from torchrl.record.loggers.wandb import WandbLogger as Backend
 
@@ -193,7 +193,7 @@ class MlflowLogger(BackendLogger):
         experiment: str = "pickplace",
         uri: str | None = None,
     ):
-        with needs_extra("logger", "mlflow"):
+        with require_extra("logger", "mlflow"):
             import mlflow
         from torchrl.record.loggers.mlflow import MLFlowLogger as Backend
 

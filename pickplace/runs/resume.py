@@ -12,7 +12,16 @@ from loky import cpu_count
 from omegaconf import DictConfig, OmegaConf
 
 from pickplace.common.errors import WorkerDied, sentence
-from pickplace.common.validate import MAX_COUNT, excerpt, is_name, is_whole, number, refuse_if, reworded, whole_number
+from pickplace.common.validate import (
+    MAX_COUNT,
+    excerpt,
+    is_name,
+    is_whole,
+    number,
+    refuse_if,
+    reword_errors,
+    whole_number,
+)
 from pickplace.config.allowlist import modules_to_trust, own_modules, saved_form, trusted_config
 from pickplace.config.composition import apply_overrides, compose_plain, parse, refuse_unknown_keys
 from pickplace.runs.folder import refuse_occupied, refuse_training
@@ -85,7 +94,7 @@ def resumed_config(place: str, facts: dict, overrides: list[str]) -> DictConfig:
     trust = own_modules(next((word.value() for word in reversed(given) if word.key_or_group == "trust"), None))
     saved = trusted_config(facts["config"], trust, groups=None)
     saved["trust"] = list(trust)  # only the user says what to trust, never the checkpoint
-    with reworded(ValueError, lambda error: ValueError(f"resume={place}: in the checkpoint's config, {error}")):
+    with reword_errors(ValueError, lambda error: ValueError(f"resume={place}: in the checkpoint's config, {error}")):
         refuse_unknown_keys(saved, compose_plain("train"))
     repeated = {word.key_or_group for word in given}
     for key, value in _remote_values(saved):
@@ -238,4 +247,4 @@ def checkpoint_hint(
         whole = f"What was saved before is whole: pickplace-train resume={folder}{arguments}"
         return kind(f"{sentence(error).rstrip('.')}. {whole if folder else 'Nothing had been saved before.'}")
 
-    return reworded(errors, hinted)
+    return reword_errors(errors, hinted)

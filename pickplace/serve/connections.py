@@ -7,13 +7,13 @@ CONNECTIONS = 32  # greatest number at a time; each may hold one request in memo
 CLIENT_SECONDS = 10  # time that a client has to send the headers of a request, or to read an answer
 CHECKS = 10  # number of checks in that time
 
-CROWDED = JSONResponse(
+BUSY_RESPONSE = JSONResponse(
     {"error": f"more than {CONNECTIONS} requests are open; expected the next one after 1 s."},
     503,
     {"Retry-After": "1", "Connection": "close"},
 )
 
-AMBIGUOUS = JSONResponse(
+AMBIGUOUS_LENGTH_RESPONSE = JSONResponse(
     {"error": "Content-Length and Transfer-Encoding: got both, expected one: they may disagree where the body ends."},
     400,
     {"Connection": "close"},
@@ -34,15 +34,15 @@ class Connection(H11Protocol):
         self.app = _refuse_ambiguous(self.config.loaded_app)
         self.since = self.loop.time()  # when the connection was made, or its last answer written
         if len(self.connections) > CONNECTIONS:
-            idle = [each for each in self.connections if each is not self and each.is_clients_move]
+            idle = [each for each in self.connections if each is not self and each.is_waiting_for_client]
             if idle:
                 min(idle, key=lambda each: each.since).end()
             else:
-                self.app = CROWDED
+                self.app = BUSY_RESPONSE
         self._check(None, 0)
 
     @property
-    def is_clients_move(self) -> bool:
+    def is_waiting_for_client(self) -> bool:
         """Whether the service waits for the client: to send a request, or to read an answer."""
         return self.cycle is None or self.cycle.response_complete or self.flow.write_paused
 
@@ -57,7 +57,7 @@ class Connection(H11Protocol):
 
     def _check(self, last_cycle, waits: int) -> None:
         """End the connection if it waited for its client at each of the last checks, with no request between them."""
-        waits = waits + 1 if self.is_clients_move and self.cycle is last_cycle else 0
+        waits = waits + 1 if self.is_waiting_for_client and self.cycle is last_cycle else 0
         if waits > CHECKS:
             self.end()
         elif self in self.connections:
@@ -70,6 +70,6 @@ def _refuse_ambiguous(app):
     async def checked(scope, receive, send):
         keys = {key for key, _ in scope.get("headers", ())}
         is_ambiguous = {b"content-length", b"transfer-encoding"} <= keys
-        await (AMBIGUOUS if is_ambiguous else app)(scope, receive, send)
+        await (AMBIGUOUS_LENGTH_RESPONSE if is_ambiguous else app)(scope, receive, send)
 
     return checked

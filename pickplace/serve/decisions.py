@@ -26,7 +26,7 @@ class DecisionLog:
 
     Args:
         path: the file.
-        start: facts of the service, see :func:`what_is_served`.
+        start: facts of the service, see :func:`service_facts`.
 
     Raises:
         OSError: if it cannot be written.
@@ -50,7 +50,7 @@ class DecisionLog:
                 file.write(json.dumps(line, default=vars) + "\n")  # `default` is for boxes
 
 
-def what_is_served(planner: "Planner", args) -> dict[str, Any]:
+def service_facts(planner: "Planner", args) -> dict[str, Any]:
     """Return the facts from which :func:`replay` makes the planner of a command line again."""
     from pickplace.policies.restore import cell_settings  # here, so that --help does not wait for torch
     from pickplace.runs.locate import read_facts

@@ -13,13 +13,13 @@ import numpy as np
 from pickplace.common.errors import Parser, one_sentence, write_output
 from pickplace.common.files import read_file
 from pickplace.common.interrupts import import_quietly
-from pickplace.common.validate import refuse_if, reworded
+from pickplace.common.validate import refuse_if, reword_errors
 from pickplace.robot.box import DepthMapError
 from pickplace.runs.locate import read_facts
 from pickplace.serve.deadline import Deadline
 from pickplace.serve.decisions import replay
 from pickplace.serve.options import PARTS, load_planner, plan_once, planner_options
-from pickplace.serve.request import Limits, PlanRequest, answer, to_json
+from pickplace.serve.request import PlanRequest, RequestLimits, answer, to_json
 
 if TYPE_CHECKING:
     from pickplace.robot.planner import Planner
@@ -102,7 +102,7 @@ def run(args: argparse.Namespace) -> None:
         write_output(to_json(result, indent=1) + "\n")
         return
     plan_once(planner)
-    most = Limits.of(planner.cell).size
+    most = RequestLimits.of(planner.cell).size
     for line in read_lines(sys.stdin.buffer, most):
         if line.strip() or len(line) > most:
             with latency(args.time):
@@ -174,7 +174,7 @@ def read_map(path: str) -> np.ndarray:
         OSError: if the file is missing or cannot be read.
     """
     content = read_file(path, MAX_MAP, empty=False)
-    with reworded(
+    with reword_errors(
         Exception,  # any type, as numpy evaluates the header
         lambda _: ValueError(f"{path}: cannot be read; expected a .npy file with one array of numbers."),
     ):

@@ -12,9 +12,9 @@ from pickplace.common.validate import excerpt
 from pickplace.robot.measure import patches
 from pickplace.rules.cell import CellSpec
 from pickplace.serve.request import PlanRequest
-from pickplace.views.replay import effector_parts, filled
+from pickplace.views.replay import effector_parts, fill_template
 
-MOST_COLUMNS = 60  # greatest number of columns along a side of the tote that the page draws
+MAX_COLUMNS = 60  # greatest number of columns along a side of the tote that the page draws
 
 
 def page(cell: CellSpec) -> str:
@@ -26,7 +26,7 @@ def page(cell: CellSpec) -> str:
         **effector_parts(cell),
         "height": cell.tote_size[2] * cell.height_unit,
     }
-    return filled("live.html", data=json.dumps(data))
+    return fill_template("live.html", data=json.dumps(data))
 
 
 def content_policy(html: str) -> str:
@@ -66,7 +66,7 @@ def _scene(cell: CellSpec, request: PlanRequest, plan: dict) -> dict:
     along, up = (1.0, cell.height_unit) if side is None else (1 / side, 1 / side)  # cells per unit of length
     height = cell.tote_size[2] * cell.height_unit if request.tote_height is None else request.tote_height * up
     sides = cell.tote_size[:2]
-    heights, _ = patches(height - np.asarray(request.tote_depth, float) * up, sides, max(1, MOST_COLUMNS // max(sides)))
+    heights, _ = patches(height - np.asarray(request.tote_depth, float) * up, sides, max(1, MAX_COLUMNS // max(sides)))
     box, item = plan["box"], plan["item"]  # both None if there are several items and none is taken
     if item and not box:
         box = {**item, "x": item["x"] + item["w"] / 2, "y": item["y"] + item["d"] / 2, "yaw": 0.0}

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pickplace.common.files import read_text
-from pickplace.common.validate import check_bytes, first_line, number, refuse_if, reworded, whole_number
+from pickplace.common.validate import check_bytes, first_line, number, refuse_if, reword_errors, whole_number
 from pickplace.robot.box import DepthMapError
 from pickplace.serve.deadline import Deadline
 from pickplace.serve.request import DEADLINE, MAX_DEADLINE, PLAN_OPTIONS, PlanRequest
@@ -169,7 +169,7 @@ def _read_yaml(option: str, name: str, path, expected: str) -> Any:
     """Return the content of the file at ``path``, the value ``name`` of an option; ``expected`` ends its errors."""
     from yaml import YAMLError, safe_load  # here, so that --help is fast
 
-    with reworded(
+    with reword_errors(
         (OSError, ValueError, YAMLError),
         lambda error: ValueError(f"--{option}={name}: {first_line(error)}; {expected}"),
     ):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from typing_extensions import Self
 
 from pickplace.common.errors import sentence
-from pickplace.common.validate import at_most, number, refuse_any, refuse_if, reworded, without_twins
+from pickplace.common.validate import number, refuse_above, refuse_any, refuse_if, reword_errors, unique_keys
 from pickplace.robot.box import ACCURACY, CLEARANCE, Box, EmptyBinError
 from pickplace.serve.deadline import Deadline
 
@@ -25,7 +25,7 @@ Labels = list[list[int]]
 
 
 @dataclass(frozen=True)
-class Limits:
+class RequestLimits:
     """Limits of a request for a cell: its maps, each with :data:`FINE` values along a cell, and some more."""
 
     size: int  # in bytes
@@ -46,7 +46,7 @@ class Limits:
     def check(self, text: bytes) -> None:
         """Refuse, with a ``ValueError``, a text with too many bytes or lists for the cell, before it is parsed."""
         refuse_if(len(text) > self.size, f"the request has more than {self.size:,} bytes; expected a shorter one.")
-        at_most("the request has", text.count(b"["), "lists, rows of maps included", self.lists)
+        refuse_above("the request has", text.count(b"["), "lists, rows of maps included", self.lists)
 
 
 def _key(description: str, default: Any = None, option: type | None = None) -> Any:
@@ -178,12 +178,12 @@ def parse_json(text: bytes) -> dict:
     Raises:
         ValueError: for a text that is no object in JSON, or has a key twice.
     """
-    with reworded(
+    with reword_errors(
         (json.JSONDecodeError, UnicodeDecodeError, RecursionError),
         lambda error: ValueError(f"the request is not JSON: {error}."),
     ):
         given = json.loads(
-            text.decode(), parse_constant=finite_float, parse_float=finite_float, object_pairs_hook=without_twins
+            text.decode(), parse_constant=finite_float, parse_float=finite_float, object_pairs_hook=unique_keys
         )
     refuse_if(
         not isinstance(given, dict), f"got {type(given).__name__}, expected an object with bin_depth and tote_depth."
@@ -198,7 +198,7 @@ def finite_float(text: str) -> float:
     raise ValueError(f"the request is not JSON: got {text[:20]}, expected a finite number.")
 
 
-def read_request(text: bytes, limits: Limits, defaults: dict) -> tuple[int, dict, PlanRequest | None]:
+def read_request(text: bytes, limits: RequestLimits, defaults: dict) -> tuple[int, dict, PlanRequest | None]:
     """Return the HTTP status 200, the beginning of the reply with the ``id``, and the request that a text states.
 
     For a bad request: the HTTP status, ``{"error": ...}`` in one sentence, and None.
@@ -239,7 +239,7 @@ def to_json(reply: dict, **settings) -> str:
     Raises:
         FloatingPointError: for a number that is not finite, which comes only from weights that no training made.
     """
-    with reworded(
+    with reword_errors(
         ValueError,
         lambda _: FloatingPointError("the plan has a number that is not finite; expected another checkpoint."),
     ):
@@ -248,7 +248,7 @@ def to_json(reply: dict, **settings) -> str:
 
 def answer(planner: "Planner", text: bytes, defaults: dict) -> Answer:
     """Return the answer to a line of ``pickplace-plan``."""
-    status, reply, request = read_request(text, Limits.of(planner.cell), defaults)
+    status, reply, request = read_request(text, RequestLimits.of(planner.cell), defaults)
     if request is None:
         return Answer(status, reply, json.dumps(reply))
     return solve(planner, request, reply, Deadline(request.deadline))

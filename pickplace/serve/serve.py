@@ -8,11 +8,11 @@ import socket
 from pickplace.common.errors import Parser, one_sentence, write_output
 from pickplace.common.interrupts import import_quietly
 from pickplace.common.validate import excerpt, number, refuse_if, short_text, whole_number
-from pickplace.serve.decisions import DecisionLog, what_is_served
+from pickplace.serve.decisions import DecisionLog, service_facts
 from pickplace.serve.options import load_planner, plan_once, planner_options
 
 TOKEN = "PICKPLACE_TOKEN"  # an environment variable, as every user of the machine can read a command line
-LEAST_TOKEN = 16  # fewest characters
+MIN_TOKEN = 16  # fewest characters
 
 
 @one_sentence()
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> None:
 
     planner, defaults = load_planner(args)
     plan_once(planner)
-    log = None if args.log is None else DecisionLog(args.log, what_is_served(planner, args))
+    log = None if args.log is None else DecisionLog(args.log, service_facts(planner, args))
     host = f"[{args.host}]" if ":" in args.host else args.host
     # The names by which clients may call the service. A foreign page whose name leads to this machine (DNS rebinding)
     # uses another name. If the service listens at all addresses and no name is given, any name is accepted: the token
@@ -126,7 +126,7 @@ def checked_token(host: str) -> str | None:
     )
     refuse_if(
         token is not None
-        and (len(token) < LEAST_TOKEN or not token.isascii() or not token.isprintable() or " " in token),
-        f"{TOKEN}: got {len(token or '')} characters; expected at least {LEAST_TOKEN}, printable ASCII without spaces.",
+        and (len(token) < MIN_TOKEN or not token.isascii() or not token.isprintable() or " " in token),
+        f"{TOKEN}: got {len(token or '')} characters; expected at least {MIN_TOKEN}, printable ASCII without spaces.",
     )
     return token

@@ -30,7 +30,7 @@ from pickplace.serve import live
 from pickplace.serve.deadline import Deadline
 from pickplace.serve.decisions import DecisionLog
 from pickplace.serve.metrics import Metrics
-from pickplace.serve.request import Answer, Limits, PlanRequest, read_request, solve
+from pickplace.serve.request import Answer, PlanRequest, RequestLimits, read_request, solve
 from pickplace.serve.schema import request_schema, with_comments
 
 MAX_WAITING = 16  # greatest number of requests whose body is read, or that wait for their turn
@@ -96,7 +96,7 @@ class Service:
 
     def __init__(self, planner: Planner, defaults: dict, history: int, log: DecisionLog | None):
         self.planner, self.defaults, self.log = planner, defaults, log
-        self.limits, self.metrics = Limits.of(planner.cell), Metrics()
+        self.limits, self.metrics = RequestLimits.of(planner.cell), Metrics()
         self.worker = ThreadPoolExecutor(1, "planner")
         self.waiting = self.count = 0
         self.lock = Lock()

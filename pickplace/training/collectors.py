@@ -12,8 +12,8 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.collectors.distributed import RayCollector
 
-from pickplace.common.errors import WorkerDied, needs_extra
-from pickplace.common.validate import expect, reworded, whole_number
+from pickplace.common.errors import WorkerDied, require_extra
+from pickplace.common.validate import expect, reword_errors, whole_number
 from pickplace.runs.locate import CheckpointError
 from pickplace.runs.resume import STOP_SIGNALS
 
@@ -77,7 +77,7 @@ class ResumableCollector(Collector):
 def _ray_errors():
     from ray.exceptions import RayActorError
 
-    with reworded(RayActorError, lambda _: WorkerDied("a Ray worker of the collector has died.")):
+    with reword_errors(RayActorError, lambda _: WorkerDied("a Ray worker of the collector has died.")):
         yield
 
 
@@ -127,7 +127,7 @@ def set_rng_state(state: dict, device: torch.device) -> None:
     Raises:
         CheckpointError: if the state is not valid.
     """
-    with reworded(
+    with reword_errors(
         RuntimeError,
         lambda _: CheckpointError("The checkpoint's random generator is of no use: its state is not valid."),
     ):
@@ -259,7 +259,7 @@ def ray(
     Raises:
         ValueError: without the extra, with a policy on a GPU, or if the workers do not divide the slots.
     """
-    with needs_extra("collector", "ray"):
+    with require_extra("collector", "ray"):
         import ray  # noqa: F401
     expect(
         not any(parameter.is_cuda for parameter in policy.parameters()),

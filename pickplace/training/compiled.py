@@ -5,7 +5,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import Compose, TransformedEnv
 
-from pickplace.common.graphs import Compile, Work
+from pickplace.common.graphs import CompileSettings, Work
 from pickplace.envs.torchrl import PickPlaceEnv
 from pickplace.training.curriculum.transform import ToteHeightCurriculum
 
@@ -15,18 +15,18 @@ class CompiledPolicy(TensorDictModuleBase):
 
     Args:
         policy: reads and writes TensorDicts ``[N]``, always with the same ``N``.
-        how: how it is compiled.
+        settings: how it is compiled.
     """
 
-    def __init__(self, policy: TensorDictModuleBase, how: Compile):
+    def __init__(self, policy: TensorDictModuleBase, settings: CompileSettings):
         super().__init__()
-        self.policy, self.how = policy, how
+        self.policy, self.settings = policy, settings
         self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
         self._compiled: Work | None = None
 
     def forward(self, frames: TensorDictBase) -> TensorDictBase:
         if self._compiled is None:
-            self._compiled = self.how.network(self._act, "the acting policy")
+            self._compiled = self.settings.network(self._act, "the acting policy")
         return frames.update(self._compiled({key: frames[key] for key in self.in_keys}))
 
     def _act(self, entries: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -34,7 +34,7 @@ class CompiledPolicy(TensorDictModuleBase):
         return {key: frames[key] for key in self.out_keys}
 
 
-class RecordedEnv(TransformedEnv):
+class CapturedEnv(TransformedEnv):
     """A training environment whose step, with the resets that follow it, is one recorded piece of work.
 
     It returns the same as TorchRL's ``step_and_maybe_reset``. The levels of new episodes are drawn on the CPU in every
@@ -44,12 +44,12 @@ class RecordedEnv(TransformedEnv):
     Args:
         env: the environment.
         levels: the curriculum.
-        how: how the work is compiled.
+        settings: how the work is compiled.
     """
 
-    def __init__(self, env: PickPlaceEnv, levels: ToteHeightCurriculum, how: Compile):
+    def __init__(self, env: PickPlaceEnv, levels: ToteHeightCurriculum, settings: CompileSettings):
         super().__init__(env, Compose(levels))
-        self._compiled = how.steps(self._advance, "the environment")
+        self._compiled = settings.steps(self._advance, "the environment")
 
     def reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
         state = super().reset(tensordict, **kwargs)

@@ -13,7 +13,7 @@ from typing import Any
 log = logging.getLogger(__name__)  # of the lines
 results = logging.getLogger("pickplace.results")  # of the lines that quiet=true shows, too
 
-LEAST_LINES = 20  # of a whole run
+MIN_LINES = 20  # of a whole run
 LONGEST = 1e10  # greatest remaining time that is shown; s
 REFRESH = 0.1  # least time between two pictures of the bar; s
 
@@ -36,7 +36,7 @@ class Progress:
     """
 
     def __init__(self, frames: int, total: int, interval: int, bar: Any = None):
-        self.start, self.total, self.interval = frames, total, min(interval, max(total // LEAST_LINES, 1))
+        self.start, self.total, self.interval = frames, total, min(interval, max(total // MIN_LINES, 1))
         self.started = self.drawn = time.perf_counter()
         self.parts: dict[str, str] = {}
         self.bar, self.task = bar, bar and bar.add_task("", total=total, completed=frames)

@@ -17,7 +17,7 @@ from pickplace.runs.locate import read_facts
 from pickplace.runs.loggers import read_csv
 from pickplace.training.curriculum.curriculum import Curriculum
 from pickplace.views.figures import failure_mix, played_levels
-from pickplace.views.replay import filled, page
+from pickplace.views.replay import fill_template, page
 from pickplace.views.scene import draw_scene, item_colours
 
 
@@ -47,7 +47,7 @@ def write_report(
     Raises:
         OSError: naming the report, if it cannot be written.
     """
-    rows, level_name, tote = read_csv(run_dir / "metrics.csv"), curriculum.what, io.BytesIO()
+    rows, level_name, tote = read_csv(run_dir / "metrics.csv"), curriculum.level_name, io.BytesIO()
     validations = [row for row in rows if "eval/occupancy" in row]
     saved = read_facts(run_dir)
     after = f", after {saved['frames']:,} frames" if saved else ""
@@ -83,7 +83,7 @@ def write_report(
         "replay": escape(page(ordered, cell, replay, at_end=True)),
     }
     with replaced_file(run_dir / REPORT) as new:
-        new.write_text(filled("report.html", **parts), encoding="utf-8")
+        new.write_text(fill_template("report.html", **parts), encoding="utf-8")
 
 
 def _picture(text: str, content: bytes) -> str:

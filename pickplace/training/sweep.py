@@ -94,7 +94,7 @@ def read_run(folder: Path) -> SweepRun:
     return run
 
 
-class Setting:
+class SweepSetting:
     """The runs of a sweep that differ in their seed only, and statistics over those that finished.
 
     Attributes:
@@ -147,7 +147,7 @@ def bootstrap95(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return bootstrap((values,), np.mean, axis=-1, **settings).confidence_interval
 
 
-def group_by_setting(runs: list[SweepRun]) -> list[Setting]:
+def group_by_setting(runs: list[SweepRun]) -> list[SweepSetting]:
     """Return the settings of a sweep: its runs, grouped by their overrides without the seed.
 
     A run whose overrides cannot be read belongs to none.
@@ -156,10 +156,10 @@ def group_by_setting(runs: list[SweepRun]) -> list[Setting]:
     for run in runs:
         if run.status != "unreadable" or run.overrides:
             groups[frozenset(item for item in run.overrides.items() if item[0] != "seed")].append(run)
-    return [*map(Setting, groups.values())]
+    return [*map(SweepSetting, groups.values())]
 
 
-def summarize(folder: Path) -> list[Setting]:
+def summarize(folder: Path) -> list[SweepSetting]:
     """Write tables and figure of a sweep into its folder; return the settings in the order of their folders' names.
 
     Raises:
@@ -209,7 +209,7 @@ def _write_table(path: Path, columns: list[str], rows: list[list]) -> None:
         csv.writer(file).writerows([columns, *rows])
 
 
-def label(setting: Setting, settings: list[Setting]) -> str:
+def label(setting: SweepSetting, settings: list[SweepSetting]) -> str:
     """Label of a setting: the overrides in which settings differ, and its runs that did not use their budget."""
     words = [
         f"{key}={value}"
@@ -221,7 +221,7 @@ def label(setting: Setting, settings: list[Setting]) -> str:
     return (", ".join(words) or ("all runs" if len(settings) == 1 else "defaults")) + (f" ({counts})" if counts else "")
 
 
-def results(settings: list[Setting]) -> list[str]:
+def results(settings: list[SweepSetting]) -> list[str]:
     """A line of text for each setting, in columns: mean final occupancy, its interval, seeds, frames, and the label."""
     rows = []
     for setting in settings:
@@ -237,7 +237,7 @@ def results(settings: list[Setting]) -> list[str]:
     return ["  ".join(row).rstrip() for row in padded]
 
 
-def draw(settings: list[Setting], path: Path) -> None:
+def draw(settings: list[SweepSetting], path: Path) -> None:
     """Draw the mean validation curve of each setting over its finished runs, with its 95% interval, in this order.
 
     Thin lines are runs: their spread over the seeds, where each ended, and those that did not finish. The interval of

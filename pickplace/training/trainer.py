@@ -14,9 +14,9 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torchrl.envs import Compose, TransformedEnv
 
-from pickplace.algorithms.base import Algorithm, At, Task
+from pickplace.algorithms.base import Algorithm, BatchPosition, Task
 from pickplace.algorithms.imitation import WarmStart, with_warm_start
-from pickplace.common.graphs import PLAIN, Compile
+from pickplace.common.graphs import NO_COMPILE, CompileSettings
 from pickplace.common.machine import use_machine
 from pickplace.common.validate import excerpt, expect, refuse_if
 from pickplace.config.registry import build
@@ -38,7 +38,7 @@ from pickplace.runs.resume import (
     stale_best_frames,
 )
 from pickplace.training import callbacks, collectors, settings
-from pickplace.training.compiled import CompiledPolicy, RecordedEnv
+from pickplace.training.compiled import CapturedEnv, CompiledPolicy
 from pickplace.training.curriculum.curriculum import Curriculum
 from pickplace.training.curriculum.transform import ToteHeightCurriculum, push_level
 from pickplace.training.progress import Progress, has_passed, results, terminal_bar
@@ -80,7 +80,9 @@ class Trainer:
         self.cfg, self.run_dir, self.resumed = cfg, run_dir, resume is not None
         self.saved_config, self.resume_overrides = checkpoint_config(cfg)
         self.device = use_machine(cfg)
-        self.compile: Compile = build("compile", cfg.compile) if cfg.get("compile") else PLAIN  # older runs have none
+        self.compile: CompileSettings = (
+            build("compile", cfg.compile) if cfg.get("compile") else NO_COMPILE
+        )  # older runs have none
         torch.manual_seed(cfg.seed)
         self.state, facts, self.safe_folder = resume or ({}, {}, None)
         self.frames, self.iteration, self.best, self.latest = ({**NEW, **facts}[key] for key in NEW)
@@ -99,7 +101,7 @@ class Trainer:
         for warning in (*self.curriculum.unused_settings(), *([shortage] if shortage else [])):
             log.warning(warning)
         self.acting = self.algorithm.acting_policy()
-        if self.compile != PLAIN:
+        if self.compile != NO_COMPILE:
             self.acting = CompiledPolicy(self.acting, self.compile)
         base_env = partial(self.build_training_env, masks=self.policy.masks, episode_stride=cfg.env.num_envs)
         self.collector = build(
@@ -249,7 +251,7 @@ class Trainer:
                 log.info(
                     "%s frames to train, at %s %d of %d",
                     f"{max(self.cfg.total_frames - self.frames, 0):,}",
-                    self.curriculum.what,
+                    self.curriculum.level_name,
                     self.curriculum.level,
                     self.curriculum.end,
                 )
@@ -261,8 +263,8 @@ class Trainer:
 
     def learn(self, batch: TensorDictBase) -> dict:
         """Count a batch ``[N, T]``, move the curriculum by it and learn from it; return metrics."""
-        at = At(self.frames, self.frames + batch.numel(), self.iteration + 1, self.cfg.total_frames)
-        self.frames, self.iteration, level = at.frames, at.iteration, self.curriculum.level
+        position = BatchPosition(self.frames, self.frames + batch.numel(), self.iteration + 1, self.cfg.total_frames)
+        self.frames, self.iteration, level = position.frames, position.iteration, self.curriculum.level
         done = batch["next", "done"][..., 0]
         key, weights = self.curriculum.levels.key, self.curriculum.weights
         levels, occupancy = (batch["next", entry][done][:, 0] for entry in (key, "occupancy"))
@@ -271,9 +273,9 @@ class Trainer:
             push_level(self.collector, self.curriculum.level, self.curriculum.weights)
         if self.curriculum.level != level:
             tell = log.debug if self.curriculum.weights else log.info  # drawn levels change all the time
-            tell("%s frames: %s %d -> %d", f"{self.frames:,}", self.curriculum.what, level, self.curriculum.level)
+            tell("%s frames: %s %d -> %d", f"{self.frames:,}", self.curriculum.level_name, level, self.curriculum.level)
             callbacks.call(self.callbacks, "on_level_change", self, level, self.curriculum.level)
-        check_metrics("algo", learnt := self.algorithm.learn(batch, at))
+        check_metrics("algo", learnt := self.algorithm.learn(batch, position))
         taken = ", ".join(sorted(metrics.keys() & learnt.keys()))
         refuse_if(taken, f"algo: it logs {taken}, which the training logs itself; expected other names.")
         return metrics | learnt
@@ -309,7 +311,7 @@ class Trainer:
         if has_passed(before, frames, cfg.checkpoint_interval):
             self.save("last")
         if not self.ended:
-            level = f"{self.curriculum.what} {self.curriculum.level}/{self.curriculum.end}"
+            level = f"{self.curriculum.level_name} {self.curriculum.level}/{self.curriculum.end}"
             self.progress.show(before, frames, metrics, level)
 
     def save(self, name: str) -> None:
@@ -353,13 +355,13 @@ class Trainer:
             log.info(
                 "the curriculum came to %s %d of %d only, so the policy was not trained above it; "
                 "train longer, or let a level end sooner (curriculum.advance, see docs/curriculum.md)",
-                self.curriculum.what,
+                self.curriculum.level_name,
                 level,
                 end,
             )
         if not rows:
             return
-        levels = self.curriculum.what, end
+        levels = self.curriculum.level_name, end
         learning_curve(table, run_dir / "learning_curve.png", levels, self.ended)
         # Without a validation, such as after logger=none, there is nothing to report.
         is_validated = self.best >= 0 and any("eval/occupancy" in row for row in rows)
@@ -372,11 +374,13 @@ class Trainer:
             write_report(run_dir, self.cfg, self.best, replayed, self.env.cell, made_with, self.curriculum, self.ended)
 
 
-def training_env(base_env, curriculum: Curriculum, how: Compile, first_episode: int, num_envs: int) -> TransformedEnv:
+def training_env(
+    base_env, curriculum: Curriculum, settings: CompileSettings, first_episode: int, num_envs: int
+) -> TransformedEnv:
     """Make the environment of one collector process: slots ``first_episode ..``, under the curriculum."""
     levels = ToteHeightCurriculum(curriculum.level, curriculum.sample, curriculum.levels, curriculum.weights)
     env = base_env(first_episode=first_episode, num_envs=num_envs)
-    return RecordedEnv(env, levels, how) if how.cudagraphs else TransformedEnv(env, Compose(levels))
+    return CapturedEnv(env, levels, settings) if settings.cudagraphs else TransformedEnv(env, Compose(levels))
 
 
 def episode_metrics(batch: TensorDictBase) -> dict[str, float]:

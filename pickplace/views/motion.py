@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 INTERVAL = 0.05  # time between two pictures, s
-STILL = np.repeat((1e-4, 1e-3), (3, 4))  # change below which a body has not moved: position, m, and quaternion
+POSE_TOLERANCE = np.repeat((1e-4, 1e-3), (3, 4))  # change below which a body has not moved: position, m, and quaternion
 
 
 @dataclass
@@ -42,7 +42,7 @@ class Motion:
         self.boxes += [[] for _ in range(len(boxes) - len(self.boxes))]
         bodies = list(zip(self.boxes, boxes, strict=True))
         for poses, pose in bodies if plate is None else [*bodies, (self.plate, plate)]:
-            if not poses or (np.abs(pose - poses[-1][1:]) > STILL).any():
+            if not poses or (np.abs(pose - poses[-1][1:]) > POSE_TOLERANCE).any():
                 poses.append((self.pictures, *pose.tolist()))
         self.pictures += 1
 

@@ -46,7 +46,7 @@ def page(recordings: list[Recording], cell: CellSpec, title: str, at_end: bool =
         "episodes": [_episode(recording, cell) for recording in recordings],
     }
     packed = base64.b64encode(zlib.compress(json.dumps(data, separators=(",", ":")).encode(), 9)).decode()
-    return filled("replay.html", title=escape(title), data=packed)
+    return fill_template("replay.html", title=escape(title), data=packed)
 
 
 def effector_parts(cell: CellSpec) -> dict:
@@ -61,7 +61,7 @@ def asset(name: str) -> str:
     return (ASSETS / name).read_text(encoding="utf-8")
 
 
-def filled(template: str, **parts: str) -> str:
+def fill_template(template: str, **parts: str) -> str:
     """Fill a template, in which ``{{name}}`` stands for one of the parts, or for a part that all pages share."""
     shared = {
         "style": asset("page.css").rstrip(),

@@ -156,8 +156,10 @@ def test_imitation_learns_the_teachers_choices(states):
 
 def test_phases_follow_each_other():
     """The teacher is asked, then the critic learns alone, then the algorithm learns as without a teacher."""
-    inner = SimpleNamespace(next_keys=(), learn=lambda batch, at: "reward", prepare=lambda batch, at: batch.reshape(-1))
-    inner.descend = lambda data, at, objective: "imitation" if "taught" in data else "critic"
+    inner = SimpleNamespace(
+        next_keys=(), learn=lambda batch, position: "reward", prepare=lambda batch, position: batch.reshape(-1)
+    )
+    inner.descend = lambda data, position, objective: "imitation" if "taught" in data else "critic"
     imitation = Imitation(inner, warm_start(config(frames=100, critic_frames=50))[0])
     imitation.warm_start.ask = lambda data, iteration: torch.zeros(len(data))
     phases = [imitation.learn(TensorDict({}, [2, 3]), At(frames, 0, 1, 0)) for frames in (0, 99, 100, 149, 150)]

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.modules import ValueOperator
 
-from pickplace.algorithms.sampled_ppo import SampledPPO, of_taken_choice
+from pickplace.algorithms.sampled_ppo import SampledPPO, taken_choice_advantages
 from pickplace.algorithms.sampled_softmax import CANDIDATE_KEYS, as_sampling_policy, draw_candidates
 from pickplace.policies.base import Policy
 from pickplace.policies.fcn4d.policy import Fcn4d
@@ -144,7 +144,7 @@ def test_with_every_choice_a_candidate_and_gae_the_loss_is_the_exact_one():
     gradients = []
     for name in ("ppo", "sampled_ppo"):
         if name == "sampled_ppo":
-            data["advantage"] = of_taken_choice(gae, 7, normalize=True)
+            data["advantage"] = taken_choice_advantages(gae, 7, normalize=True)
         _, losses = algorithm_of(policy, CRITIC, f"algo={name}").objective(data)
         total = losses["loss_objective"] + losses["loss_entropy"]
         gradients += torch.autograd.grad(total, policy.values)

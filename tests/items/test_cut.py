@@ -179,7 +179,7 @@ def test_an_item_is_a_function_of_its_address(order, monkeypatch):
     for address in addresses:
         item = fresh.sample("test", *(torch.tensor([part]) for part in address), BIN)
         known[address] = torch.stack(item)[:, 0].tolist()
-    monkeypatch.setattr(kept, "KEPT_EPISODES", 3)
+    monkeypatch.setattr(kept, "MAX_CACHED_EPISODES", 3)
     cut = Cut(order=order)
     for _ in range(40):
         asked = rng.sample(addresses, rng.randint(1, 20))

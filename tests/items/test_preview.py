@@ -17,7 +17,7 @@ from pickplace.items.orders import Orders
 from pickplace.planners import lookahead, mcts
 from pickplace.planners.heuristics import RandomFeasible
 from pickplace.policies.fcn_grasp.policy import FcnGrasp
-from pickplace.rules.bin import let_in
+from pickplace.rules.bin import admit_coming_items
 from pickplace.rules.grasps import footprint_index
 from pickplace.rules.gripper.rules import Overlap
 from pickplace.rules.state import REFILLS
@@ -160,7 +160,7 @@ def test_the_state_after_a_placement_is_known(source, bin_items, refill, seed):
         x, y, w, _ = step.footprint.unbind(-1)
         footprint = footprint_index(cell.tote_size, (w != step.item.w).long(), x, y)
         expected, real = (
-            let_in(cell, put_down(cell, before, step.taken * cell.num_footprints + footprint)[0])[0],
+            admit_coming_items(cell, put_down(cell, before, step.taken * cell.num_footprints + footprint)[0])[0],
             State.from_observation(after),
         )
         known = before.coming.exists.sum(1) - expected.coming.exists.sum(1)  # that have arrived

@@ -61,7 +61,7 @@ def test_the_test_stream_is_the_file(tmp_path_factory, sequences, suffix, ends, 
     kinds = [tuple(size) for size in items.sizes.tolist()]
     assert kinds[:64] == [tuple(size) for size in drawn.sizes.tolist()] and len({*kinds}) == len(kinds)
     assert {*kinds[64:]} == {size for each in sequences for size in each if min(size) < 2}
-    assert items.arrives().all() and len(items.arrives()) == len(kinds) and items.tallest() == 5
+    assert items.arrival_mask().all() and len(items.arrival_mask()) == len(kinds) and items.tallest() == 5
 
 
 @pytest.mark.parametrize("drawn", [Uniform([2, 3], [2, 3], [2, 3]), Cut([4, 4, 4], [2, 3])])
@@ -77,7 +77,7 @@ def test_a_search_and_the_levels_of_a_curriculum_see_the_drawn_items(tmp_path, d
         assert (other.mixes, items.mixes) == (2, 1)
         mix = torch.ones_like(steps)
         assert other.sample("train", seed, steps, steps, BIN, mix).w.eq(3).all()
-        assert other.sizes[other.arrives(1), 0].tolist() == [3, 3, 3, 3, 5]
+        assert other.sizes[other.arrival_mask(1), 0].tolist() == [3, 3, 3, 3, 5]
         assert other.sample("test", seed, seed, seed, BIN, mix).w.eq(5).all()
 
 

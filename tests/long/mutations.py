@@ -40,7 +40,7 @@ SAME_RESULT = (
     ("cell.footprint_turns == 2", "Eq_GtE"),  # it is 1 or 2
     ("== 1", "Eq_LtE"),  # of counts, which are at least 1
     ("packed, slots =", ""),  # how many flags are copied at once
-    ("max_side < LEAST_SIDE", ""),  # which of two ways is taken
+    ("max_side < MIN_SIDE", ""),  # which of two ways is taken
     ("self.side <= 64", "NumberReplacer"),  # both types are exact about there
     ("advantage > 0", "Gt_GtE"),  # either weight of zero
     *(("Resting(z < FAR,", change) for change in ("Lt_IsNot", "Lt_LtE", "Lt_NotEq")),  # outside, it is too high, too

@@ -11,7 +11,7 @@ from pickplace.planners.beam import Beam, _fingerprint, _Plans
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.afterstate.policy import Afterstate, AfterstateFcn
 from pickplace.policies.fcn_grasp.policy import FcnGrasp
-from pickplace.rules.bin import let_in
+from pickplace.rules.bin import admit_coming_items
 from pickplace.rules.gripper.rules import Overlap
 from pickplace.rules.item import Item
 from pickplace.rules.masks import placing_maps
@@ -60,8 +60,8 @@ def totals(policy, state, depth):
     if len(choices) == 0 or depth == 0:
         return choices.tolist(), [0.0] * len(choices)
     after, item = put_down(policy.cell, state.repeat(len(choices)), choices)
-    after, _ = let_in(policy.cell, after)
-    values = policy.judge(state.repeat(len(choices)), choices)[2].tolist()
+    after, _ = admit_coming_items(policy.cell, after)
+    values = policy.evaluate_choices(state.repeat(len(choices)), choices)[2].tolist()
     if depth > 1 or after.coming is not None:
         later = [totals(policy, after.rows([row]), depth - 1)[1] for row in range(len(choices))]
         # Nothing follows where a full bin fits nowhere.

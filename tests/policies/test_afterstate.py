@@ -23,7 +23,7 @@ from pickplace.policies.afterstate.cells import CellsValue
 from pickplace.policies.afterstate.picture import PictureValue
 from pickplace.policies.afterstate.policy import Afterstate, AfterstateFcn
 from pickplace.policies.restore import restore_critic, restore_policy
-from pickplace.rules.bin import let_in
+from pickplace.rules.bin import admit_coming_items
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import footprint_index
 from pickplace.rules.masks import placing_maps
@@ -97,7 +97,7 @@ def test_what_waits_is_one_set(kind):
         with torch.no_grad():
             return policy.network(*(seen[key] for key in policy.network.in_keys))[:, 0]
 
-    torch.testing.assert_close(value(let_in(env.cell, left)[0]), value(left), rtol=1e-5, atol=1e-3)
+    torch.testing.assert_close(value(admit_coming_items(env.cell, left)[0]), value(left), rtol=1e-5, atol=1e-3)
     fewer = left._replace(coming=left.coming.rows((slice(None), slice(0, 1))))
     assert ((value(fewer) - value(left)).abs() > 1e-2).all()
     assert ((value(left._replace(coming=None)) - value(left)).abs() > 1e-2).all()
@@ -277,14 +277,14 @@ class Empty(PictureValue):
 
     in_keys = ("tote_depth",)
 
-    def some_parts(self, depth):
+    def chunk_parts(self, depth):
         return depth.sum((1, 2))[:, None]
 
 
 class EmptyCells(CellsValue):
     in_keys = ("tote_depth",)
 
-    def some_parts(self, depth):
+    def chunk_parts(self, depth):
         return depth
 
 

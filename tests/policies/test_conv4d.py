@@ -127,7 +127,7 @@ def test_tiles_equal_the_naive_4d_convolution(bin_size, tote_size, batch, data):
     with torch.no_grad(), pytest.MonkeyPatch.context() as patch:
         patch.setattr(conv4d, "FEW_TILES", 1)
         patch.setattr(conv4d, "TILE_BYTES", data.draw(st.sampled_from((1, 2**15, 2**23))))
-        assert model._by_tiles(*model._prepare(*maps))
+        assert model._uses_tiles(*model._prepare(*maps))
         assert_close(model(*maps), naive(model, *maps), 1e-10)
 
 
@@ -135,11 +135,11 @@ def test_no_tiles_in_low_precision():
     maps = depths((5, 5), (6, 6), batch=8)
     with torch.no_grad():
         for dtype in (torch.bfloat16, torch.float16):
-            assert not (model := network().to(dtype))._by_tiles(*model._prepare(*maps))
+            assert not (model := network().to(dtype))._uses_tiles(*model._prepare(*maps))
         model = network()
-        assert model._by_tiles(*model._prepare(*maps))
+        assert model._uses_tiles(*model._prepare(*maps))
         with torch.autocast("cpu", torch.bfloat16):
-            assert not model._by_tiles(*model._prepare(*maps))
+            assert not model._uses_tiles(*model._prepare(*maps))
 
 
 @pytest.mark.parametrize(("unit", "by_tiles"), [("avx512_bf16", True), ("amx_bf16", False), ("bf16", False)])
@@ -148,8 +148,8 @@ def test_tiles_in_float32_beat_vectors_of_bfloat16(monkeypatch, unit, by_tiles):
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {unit: True}, raising=False)
     maps, model, low = depths((5, 5), (6, 6), batch=8), network(compute_dtype="auto"), network(compute_dtype="bfloat16")
     with torch.no_grad():
-        assert model._by_tiles(*model._prepare(*maps)) is by_tiles
-        assert not low._by_tiles(*low._prepare(*maps))
+        assert model._uses_tiles(*model._prepare(*maps)) is by_tiles
+        assert not low._uses_tiles(*low._prepare(*maps))
         if by_tiles:
             assert_close(model(*maps), network()(*maps))
             assert_close(torch.cat([model(*(each[row : row + 1] for each in maps)) for row in range(8)]), model(*maps))

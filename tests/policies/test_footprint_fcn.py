@@ -15,7 +15,7 @@ from pickplace import CellSpec, Item
 from pickplace.items.distributions import Kinds, Uniform
 from pickplace.policies.base import MAP_KEYS, MASKED, as_collection_policy
 from pickplace.policies.critics import Pooled
-from pickplace.policies.depth import Contents
+from pickplace.policies.depth import ScoredItems
 from pickplace.policies.dtypes import matrix_dtype
 from pickplace.policies.fcn_grasp.network import FootprintFcn
 from pickplace.policies.fcn_grasp.policy import FcnGrasp, UnmaskedFcnGrasp
@@ -40,8 +40,8 @@ def random_maps(seed, batch, bin_size, tote_size):
 def every_score(network, bins, totes, bearing, footprint_turns):
     """Return the network's scores of all footprints, ``[N, footprint_turns, W_T, D_T, out_channels]``."""
     row, footprint = every_footprint(totes, footprint_turns)
-    contents = Contents(read_items(bins), torch.zeros_like(row))
-    scores = network.at(bins, totes, bearing, row, footprint, contents)
+    contents = ScoredItems(read_items(bins), torch.zeros_like(row))
+    scores = network.footprint_scores(bins, totes, bearing, row, footprint, contents)
     return scores.view(len(totes), footprint_turns, *totes.shape[1:], -1)
 
 
@@ -256,7 +256,7 @@ def test_the_policy_sees_the_mean_of_the_other_items():
     swapped = state.clone().set("items", state["items"][:, [0, 2, 1]])  # the order of the others is nothing to it
     swapped["footprint_mask"] = state["footprint_mask"].unflatten(1, (3, -1))[:, [0, 2, 1]].flatten(1)
     torch.testing.assert_close(policy.logits(swapped)[:, :places], changed[:, :places])
-    contents = Contents(Item.from_table(state["items"]), torch.zeros(1, dtype=torch.int64))
+    contents = ScoredItems(Item.from_table(state["items"]), torch.zeros(1, dtype=torch.int64))
     code = contents.rest_code(torch.tensor([0]), 3)
     by_hand = torch.zeros(9)
     others = [item for item in state["items"][0, 1:].tolist() if item[4]]

@@ -19,7 +19,7 @@ from pickplace import CellSpec, DepthMapError, Failure, Planner, Scene
 from pickplace.planners.heuristics import JointDBL
 from pickplace.policies.fcn4d.policy import Fcn4d
 from pickplace.robot.box import HiddenBox, UnknownBox
-from pickplace.robot.measure import Box, touches
+from pickplace.robot.measure import Box, overlap_mask
 from pickplace.robot.measured_problem import read_metric
 from pickplace.rules.grasps import all_grasps
 from pickplace.rules.reach.annulus import Annulus
@@ -236,7 +236,7 @@ def test_rectangles_touch_as_polygons_do(seed, near):
     expected = [
         meet(rectangle(centre, sides, yaws[1]), rectangle((box.x, box.y), (w, d), box.yaw)) for centre in centres
     ]
-    assert touches(centres, rectangle((0, 0), sides, yaws[1]), box).tolist() == expected
+    assert overlap_mask(centres, rectangle((0, 0), sides, yaws[1]), box).tolist() == expected
 
 
 def test_an_action_means_one_item():
@@ -245,7 +245,7 @@ def test_an_action_means_one_item():
     for _ in range(100):
         boxes = [Box(*draw.uniform(0.02, 0.23, 2), 0.02, 0.02, h, draw.uniform(-45, 45)) for h in (0.05, 0.1, 0.07)]
         if any(
-            touches(np.array([[a.x, a.y]]), rectangle((0, 0), (a.w, a.d), a.yaw), b).any()
+            overlap_mask(np.array([[a.x, a.y]]), rectangle((0, 0), (a.w, a.d), a.yaw), b).any()
             for a, b in combinations(boxes, 2)
         ):
             continue

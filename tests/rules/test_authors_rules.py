@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from pickplace import CellSpec
 from pickplace.rules.gripper.rules import Contain
-from pickplace.rules.placing import LargeItems, OnFootprints
+from pickplace.rules.placing import FootprintContact, LargeFootprintContact
 from pickplace.rules.state import surface_from
 from pickplace.rules.support.rules import Cdrl, Corners, Gopt
 
@@ -73,7 +73,7 @@ def test_every_pattern_under_a_small_item(name, w, d):
     square = torch.zeros(len(maps), 5, 5, dtype=torch.int64)
     square[:, :w, :d] = maps
     expected = [plain(each.tolist()) for each in maps]
-    assert ours(rule, OnFootprints, square, w, d) == expected
+    assert ours(rule, FootprintContact, square, w, d) == expected
     assert w * d < 3 or len({*expected}) == 2
 
 
@@ -93,7 +93,7 @@ def test_larger_items(w, d, missing, levels, seed):
         each[places // d, places % d] = torch.randint(0, levels, (len(places),), generator=random)
     for name, (rule, plain) in RULES.items():
         expected = [plain(each[:w, :d].tolist()) for each in maps]
-        for kind in (OnFootprints, LargeItems):
+        for kind in (FootprintContact, LargeFootprintContact):
             assert ours(rule, kind, maps, w, d) == expected, name
 
 
@@ -102,7 +102,7 @@ def test_level_corners_that_do_not_carry_the_item():
     maps = torch.full((3, 9, 9), 3)
     for each, corners in zip(maps, [(1, 1, 1, 1), (0, 1, 1, 1), (0, 0, 1, 1)], strict=True):
         each[0, 0], each[0, -1], each[-1, 0], each[-1, -1] = (torch.tensor(corner) for corner in corners)
-    for kind in (OnFootprints, LargeItems):
+    for kind in (FootprintContact, LargeFootprintContact):
         assert ours(Cdrl(), kind, maps, 9, 9) == [cdrl(each.tolist()) for each in maps] == [True, True, False]
 
 
@@ -113,4 +113,4 @@ def test_where_the_code_differs_from_the_text():
     maps[:, :, :4] = torch.tensor([[[int(cell) for cell in row] for row in each] for each in (three, four)])
     assert maps.sum((1, 2)).tolist() == [16, 11]
     for rule, expected in ((Corners(), [True, False]), (Cdrl(), [False, True])):
-        assert ours(rule, OnFootprints, maps, 5, 4) == expected
+        assert ours(rule, FootprintContact, maps, 5, 4) == expected

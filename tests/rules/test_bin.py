@@ -14,10 +14,10 @@ from pickplace.items.arrival import refill
 from pickplace.items.distributions import Kinds, Recorded, Uniform, hashed_uniform
 from pickplace.rules.bin import (
     add_item,
+    admit_coming_items,
     blocked_picks,
-    let_in,
+    has_occupied_bins,
     may_arrive,
-    must_share,
     remove_item,
     select_item,
     take_item,
@@ -26,7 +26,7 @@ from pickplace.rules.bin import (
 from pickplace.rules.gripper.base import reference_cell
 from pickplace.rules.item import bin_depth_from_items, bin_labels_from_items
 from pickplace.rules.masks import action_footprints, action_mask, choice_mask, placing_maps
-from pickplace.rules.state import EMPTY, REFILLS, Episode, State, surface_from
+from pickplace.rules.state import EMPTY, REFILLS, EpisodeSettings, State, surface_from
 from pickplace.rules.step import apply, put_down
 
 
@@ -124,7 +124,9 @@ def test_items_arrive_in_their_order_where_they_have_room(kind, rule, tmp_path):
     seed, episode, rows = torch.full((60,), 3), torch.arange(60), torch.arange(60) % 7 > 0
     arrived = torch.tensor([rng.randint(0, 10) for _ in range(60)])
     bins = as_items(contents, count)
-    items, after = refill(cell, source, "train", seed, episode, arrived, bins, may_arrive(cell, bins, Episode()) & rows)
+    items, after = refill(
+        cell, source, "train", seed, episode, arrived, bins, may_arrive(cell, bins, EpisodeSettings()) & rows
+    )
     for n in range(60):
         address = seed[:1], episode[n : n + 1]
         found, number = contents[n], arrived[n]
@@ -141,10 +143,14 @@ def test_what_is_seen_enters_in_its_order_at_the_first_place(count, varies):
     contents = [random_contents(rng, size, rng.choice((0, 0, 1, 3)))[:count] for _ in range(80)]
     queues = [[random_contents(rng, size, 1)[0] for _ in range(rng.randint(0, 3))] for _ in range(80)]
     limits, rules = [rng.randint(1, count) for _ in range(80)], [rng.randrange(2) for _ in range(80)]
-    episode = Episode(bin_items=torch.tensor(limits), refill=torch.tensor(rules)) if varies else Episode()
+    episode = (
+        EpisodeSettings(bin_items=torch.tensor(limits), refill=torch.tensor(rules)) if varies else EpisodeSettings()
+    )
     cell, empty = CellSpec(bin_size=(*size, 1), bin_items=count), torch.full((80, 6, 6), EMPTY, dtype=torch.int32)
     tote_height, coming = torch.full((80,), 5), as_items(queues, 3)
-    after, awaits = let_in(cell, State(empty, tote_height, as_items(contents, count), episode, coming=coming))
+    after, awaits = admit_coming_items(
+        cell, State(empty, tote_height, as_items(contents, count), episode, coming=coming)
+    )
     for n, (found, queue) in enumerate(zip(contents, queues, strict=True)):
         most, is_batch = (limits[n], REFILLS[rules[n]] == "batch") if varies else (count, False)
         closed = is_batch and bool(found)
@@ -221,7 +227,11 @@ def test_a_bin_for_one_item_takes_a_shorter_path_to_the_same_result(support):
         assert same(left, remove_item(two, padded, zero, removed).rows(first))
         assert same(left.table, torch.stack(left, -1))
     open_ = rows & ~there
-    assert not must_share(items, open_) and not must_share(padded, open_) and must_share(padded, there)
+    assert (
+        not has_occupied_bins(items, open_)
+        and not has_occupied_bins(padded, open_)
+        and has_occupied_bins(padded, there)
+    )
     assert same(add_item(items, other, open_), add_item(padded, other, open_).rows(first))
     for shown in (bin_depth_from_items, bin_labels_from_items):
         assert same(shown(items, lone.bin_size), shown(padded, lone.bin_size))

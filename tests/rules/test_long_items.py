@@ -16,7 +16,7 @@ from pickplace import CellSpec
 from pickplace.rules.gripper.rules import Contain, Overlap
 from pickplace.rules.maps import FAR
 from pickplace.rules.masks import footprint_mask, num_feasible, placing_maps
-from pickplace.rules.placing import LargeItems, OnFootprints
+from pickplace.rules.placing import FootprintContact, LargeFootprintContact
 from pickplace.rules.state import surface_from
 from pickplace.rules.step import apply
 from pickplace.rules.support import contact as contact_module
@@ -100,11 +100,11 @@ def test_an_item_of_any_size_bears_weight_inside_scipys_hull(case):
     corners = np.array([[(x + a, y + b, 1) for a in (0, 1) for b in (0, 1)]
                         for x, y in product(range(max(size)), repeat=2)])  # fmt: skip
     expected = contact.under[:, 0].numpy() & ((corners @ equations.T).max((1, 2)) < 1e-9)
-    assert contact.in_hull()[:, 0].tolist() == expected.tolist()
+    assert contact.hull_mask()[:, 0].tolist() == expected.tolist()
 
 
 @settings(max_examples=100, deadline=None)
-@given(st.sampled_from([OnFootprints, LargeItems]), st.integers(1, 7), st.integers(0, 10**6))
+@given(st.sampled_from([FootprintContact, LargeFootprintContact]), st.integers(1, 7), st.integers(0, 10**6))
 def test_rows_of_footprints_are_those_of_their_cells(kind, side, seed):
     random = torch.Generator().manual_seed(seed)
     grid = (4, 600) if seed % 20 == 0 else (7, 6)  # numbers of surface and place that need 64 bits

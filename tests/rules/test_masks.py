@@ -40,11 +40,11 @@ from pickplace.rules.support.rules import Hull
 
 
 @settings(max_examples=80)
-@given(problems(limited=st.booleans(), count=2, shaped=st.booleans()), st.sampled_from([1, placing.LEAST_SIDE]))
+@given(problems(limited=st.booleans(), count=2, shaped=st.booleans()), st.sampled_from([1, placing.MIN_SIDE]))
 def test_masks_equal_the_step_and_the_oracle(problem, least_side):
     cell, cases = problem
     state, actions = state_of(*cases), torch.arange(cell.num_actions)
-    with patch.object(placing, "LEAST_SIDE", least_side):
+    with patch.object(placing, "MIN_SIDE", least_side):
         maps = placing_maps(cell, state)
     masks, reached = action_mask(cell, maps), footprint_mask(cell, maps)
     footprints = action_footprints(cell, state.items)
@@ -229,8 +229,8 @@ def test_large_items_rest_as_small_ones_do(support, unit):
     planner, seen, stable = JointDBL(env.cell), env.reset(), 0
     for _ in range(3 if unit > 5 else 8):
         each = []
-        for sizes in ({"LEAST_SIDE": 999}, {"LEAST_SIDE": 1, "FOOTPRINTS_AT_ONCE": {"cpu": 1}},
-                      {"LEAST_SIDE": 1, "MAX_LEVELS": 1}, {"LEAST_SIDE": 1}):  # fmt: skip
+        for sizes in ({"MIN_SIDE": 999}, {"MIN_SIDE": 1, "FOOTPRINTS_AT_ONCE": {"cpu": 1}},
+                      {"MIN_SIDE": 1, "MAX_LEVELS": 1}, {"MIN_SIDE": 1}):  # fmt: skip
             with patch.multiple(placing, **sizes):
                 each.append(resting_top(env.cell, *env.state.each_item()))
         (expected_top, expected_rest), *found = each
@@ -292,7 +292,7 @@ def test_an_item_bears_weight_inside_scipys_hull(data):
     corners = np.array([[(x + a, y + b, 1) for a in (0, 1) for b in (0, 1)] for x, y in square])
     expected = under[:, 0].numpy() & ((corners @ hull.T).max((1, 2)) < 1e-9)
     contact = Contact(cells, under, torch.ones(1, dtype=torch.int32), torch.tensor([w]), torch.tensor([d]))
-    assert contact.in_hull()[:, 0].tolist() == expected.tolist()
+    assert contact.hull_mask()[:, 0].tolist() == expected.tolist()
 
 
 @pytest.mark.parametrize(("support", "third"), [("hull", SUCCESS), ("bearing", UNSTABLE)])

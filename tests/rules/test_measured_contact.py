@@ -58,7 +58,7 @@ def test_what_carries_an_item_does_so_wherever_it_is_set_down(seed, footprint, x
     high = surface(seed, footprint)
     contact = contact_of(high, footprint, sides, error)
     stable = contact.is_centre_in_hull() | contact.full
-    share, held = float(contact.share), contact.in_hull()
+    share, held = float(contact.share), contact.hull_mask()
     middle, half = np.multiply(footprint, PER_CELL) / 2, np.array(sides) * PER_CELL / 2
     begin = np.ceil(middle - half - 1e-6).astype(int)
     shape = [part.shape[1] for part in contact.uncovered]

@@ -14,7 +14,7 @@ from pickplace import Box, CellSpec, Planner, Scene
 from pickplace.config.registry import REGISTRY, build, node_of
 from pickplace.rules.gripper.rules import Contain
 from pickplace.rules.maps import FAR
-from pickplace.rules.placing import LargeItems, OnFootprints
+from pickplace.rules.placing import FootprintContact, LargeFootprintContact
 from pickplace.rules.state import surface_from
 from pickplace.rules.support.rules import RULES, Bearing, Hull, Share, Support, read_support
 
@@ -62,7 +62,7 @@ def test_large_items_touch_what_small_ones_do(side, seed):
         bearing[heights == 1] = 0  # nothing carries an item there
     surface = surface_from(heights, bearing)
     w, d = (torch.randint(1, side + 1, (2, 1, 1, 5), generator=random) for _ in range(2))
-    small, large = OnFootprints(cell, surface, w, d), LargeItems(cell, surface, w, d)
+    small, large = FootprintContact(cell, surface, w, d), LargeFootprintContact(cell, surface, w, d)
     inside = small.z < FAR
     for quantity in ("count", "share", "corners"):
         assert torch.equal(getattr(small, quantity)[inside], getattr(large, quantity)[inside]), quantity
@@ -84,7 +84,7 @@ def test_the_hull_under_larger_items_is_that_of_the_oracle(margin):
         sizes.append(size)
         expected.append(is_stable(Rules(support="hull", support_margin=margin), cells, size))
     w, d = torch.tensor(sizes).t().reshape(2, 1, 1, 1, count)
-    contact = OnFootprints(cell, surface_from(heights), w, d)
+    contact = FootprintContact(cell, surface_from(heights), w, d)
     assert Hull(margin).stable(contact)[0, 0, 0].tolist() == expected and 0.2 < sum(expected) / count < 0.8
 
 

@@ -17,9 +17,9 @@ from pickplace.runs import checkpoint
 from pickplace.runs.locate import locate
 from pickplace.serve import json_lines
 from pickplace.serve.deadline import Deadline
-from pickplace.serve.decisions import DecisionLog, what_is_served
+from pickplace.serve.decisions import DecisionLog, service_facts
 from pickplace.serve.options import load_planner
-from pickplace.serve.request import Limits, answer, read_request, solve
+from pickplace.serve.request import RequestLimits, answer, read_request, solve
 
 EMPTY = np.full((6, 6), 5)
 ITEM = np.zeros((5, 5), dtype=np.int64)
@@ -260,10 +260,10 @@ def test_the_limit_of_a_request_follows_from_the_cell():
     rows = [[0.25] * (64 * 6)] * (64 * 6)
     maps = {"bin_depth": [[0.0] * 320] * 320, "bin_labels": [[0] * 320] * 320, "tote_depth": rows}
     text = json.dumps(maps).encode()
-    Limits.of(cell).check(text)
+    RequestLimits.of(cell).check(text)
     with pytest.raises(ValueError, match="more than 2,883,872 bytes"):
-        Limits.of(cell).check(text + b" " * 2_000_000)
-    assert Limits.of(CellSpec(tote_size=(40, 40, 5))).size == 2**24
+        RequestLimits.of(cell).check(text + b" " * 2_000_000)
+    assert RequestLimits.of(CellSpec(tote_size=(40, 40, 5))).size == 2**24
 
 
 def test_a_log_is_replayed(command, tmp_path, monkeypatch):
@@ -271,7 +271,7 @@ def test_a_log_is_replayed(command, tmp_path, monkeypatch):
     log = tmp_path / "log.jsonl"
     args = json_lines.parser().parse_args(["pretrained/r4", "--tote-size", "6", "6", "5", "--support", "hull"])
     planner, defaults = load_planner(args)
-    decisions = DecisionLog(log, what_is_served(planner, args))
+    decisions = DecisionLog(log, service_facts(planner, args))
     metres = {"items": [{"x": 0.1, "y": 0.125, "w": 0.09, "d": 0.04, "h": 0.05}], "cell_size": 0.05, "id": "b"}
     given = [
         {"bin_depth": ITEM.tolist(), "tote_depth": EMPTY.tolist(), "id": 1},
@@ -280,13 +280,13 @@ def test_a_log_is_replayed(command, tmp_path, monkeypatch):
         {"bin_depth": ITEM.tolist(), "tote_depth": (EMPTY * 0).tolist()},
     ]
     for one in given:
-        _, reply, request = read_request(json.dumps(one).encode(), Limits.of(planner.cell), defaults)
+        _, reply, request = read_request(json.dumps(one).encode(), RequestLimits.of(planner.cell), defaults)
         decisions.add(request, solve(planner, request, reply, Deadline(60)).reply, 0.1)
     decisions.add(None, {"error": "the request is not JSON"}, 0.0)
     lines = log.read_text().splitlines()
     assert len(lines) == 6 and json.loads(lines[0])["start"]["checkpoint"] == "pretrained/r4"
     assert command("--replay", log) == (0, "3 of 3 plans are the same\n", "")
-    DecisionLog(log, what_is_served(planner, args))  # the service was started again
+    DecisionLog(log, service_facts(planner, args))  # the service was started again
     assert log.read_text().splitlines()[:6] == lines and command("--replay", log)[0] == 0
     changed = json.loads(lines[1])
     changed["reply"]["action"] += 1

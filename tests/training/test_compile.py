@@ -13,8 +13,8 @@ from tensordict import TensorDict
 from test_presets import ONE_NETWORK
 
 from pickplace import PickPlaceEnv
-from pickplace.common.graphs import Compile, ReadsBack, Recorded
-from pickplace.common.recording import recording
+from pickplace.common.capture import capturing
+from pickplace.common.graphs import CaptureChecker, CapturedWork, CompileSettings
 from pickplace.config.registry import build
 from pickplace.planners.heuristics import RandomFeasible
 from pickplace.policies.afterstate.cells import CellsValue
@@ -28,7 +28,7 @@ MASKS = ("action", "footprint", "corner")
 
 def recorded(work, *arguments):
     """Return the result of recorded work, and the places where it looks at results."""
-    with recording(), ReadsBack() as found:
+    with capturing(), CaptureChecker() as found:
         return work(*arguments), found.places
 
 
@@ -84,7 +84,7 @@ def test_a_recorded_environment_does_the_same(settings):
 def test_an_action_out_of_range_stops_a_recorded_environment():
     env = PickPlaceEnv(num_envs=1)
     env.reset()
-    with recording(), pytest.raises(RuntimeError):
+    with capturing(), pytest.raises(RuntimeError):
         env._step(TensorDict({"action": torch.tensor([env.cell.num_actions])}, [1]))
 
 
@@ -101,14 +101,14 @@ def test_an_action_out_of_range_stops_a_recorded_environment():
 )
 def test_work_that_looks_at_results_is_refused(work, place):
     """With the line where it does."""
-    step = Recorded(lambda x: {"b": work(x)}, "the gradient step")
+    step = CapturedWork(lambda x: {"b": work(x)}, "the gradient step")
     step({"a": torch.ones(3)})
     with pytest.raises(ValueError, match=rf"the gradient step .*\({place} in test_compile.py:\d+\); expected compile"):
         step({"a": torch.ones(3)})
 
 
 def test_work_of_another_shape_is_not_recorded():
-    step = Recorded(lambda x: {"b": 2 * x["a"]}, "")
+    step = CapturedWork(lambda x: {"b": 2 * x["a"]}, "")
     for count in (3, 2, 3):
         assert step({"a": torch.ones(count)})["b"].tolist() == [2] * count
     assert step.calls == 2
@@ -116,7 +116,7 @@ def test_work_of_another_shape_is_not_recorded():
 
 def test_the_order_of_the_inputs_does_not_matter(monkeypatch):
     emulate(monkeypatch)
-    step, one, two = Recorded(lambda x: {"c": x["a"] - x["b"]}, ""), torch.ones(2), torch.full((2,), 5.0)
+    step, one, two = CapturedWork(lambda x: {"c": x["a"] - x["b"]}, ""), torch.ones(2), torch.full((2,), 5.0)
     for _ in range(4):
         assert step({"a": two, "b": one})["c"].tolist() == [4.0, 4.0]
     assert step({"b": one, "a": two})["c"].tolist() == [4.0, 4.0]
@@ -127,14 +127,14 @@ def test_a_repeated_step_that_keeps_a_number_is_found_by_the_emulator(monkeypatc
     """The emulator itself: Python that would not run again on a GPU does not run again here."""
     emulate(monkeypatch)
     calls = []
-    step = Recorded(lambda x: {"b": x["a"] + len(calls)} if calls.append(1) is None else {}, "")
+    step = CapturedWork(lambda x: {"b": x["a"] + len(calls)} if calls.append(1) is None else {}, "")
     assert [step({"a": torch.zeros(1)})["b"].item() for _ in range(5)] == [1, 2, 3, 4, 4]
 
 
 @pytest.mark.parametrize("key", ["compile", "compile_mode", "cudagraphs"])
 def test_a_wrong_setting_is_named(key):
     with pytest.raises(ValueError, match=f"compile.{key}=3: expected"):
-        Compile(**{key: 3})
+        CompileSettings(**{key: 3})
 
 
 @pytest.mark.parametrize("sides", [(5, 5), (4, 6)])
@@ -248,7 +248,7 @@ def test_a_repeated_training_equals_one_that_runs_each_time(name, device, tmp_pa
     for option in ("repeated", "run"):
         if option == "run":
             assert device == "cuda" or Graph.replays > 20
-            monkeypatch.setattr(Recorded, "_make_graph", lambda self, device: self.work)
+            monkeypatch.setattr(CapturedWork, "_make_graph", lambda self, device: self.work)
         more = ["compile=cudagraphs", f"device={device}", "total_frames=128", "evaluation_interval=48"]
         more += ["algo.minibatch_size=6", "curriculum=paper", "curriculum.advance.frames_per_level=32"]
         train(composed(*words(name), *more), tmp_path / option)
@@ -268,7 +268,7 @@ def test_a_repeated_environment_equals_a_plain_one(settings, device):
     curriculum = build("curriculum", cfg.curriculum)
     make = partial(PickPlaceEnv, device=device, masks=MASKS, tote_size=(6, 6, 3), **settings)
     curriculum.setup(make(num_envs=1).cell, make(num_envs=1).items, 1_000)
-    plain, repeated = (training_env(make, curriculum, Compile(cudagraphs=flag), 0, 8) for flag in (False, True))
+    plain, repeated = (training_env(make, curriculum, CompileSettings(cudagraphs=flag), 0, 8) for flag in (False, True))
     planner, state, other = RandomFeasible(plain.base_env.cell), plain.reset(), repeated.reset()
     steps = []
     for number in range(20):

@@ -41,7 +41,7 @@ def test_levels_are_numbered_from_1_and_what_they_leave_out_is_that_of_the_full_
         "refill": [0, 0, 1, 0], "preview": [2, 2, 0, 2],
     }  # fmt: skip
     assert levels.entries["rotations"].int().tolist() == [[1, 0, 0, 0], [1, 0, 0, 1], [1] * 4, [1] * 4]
-    assert [levels.items.arrives(mix).int().tolist() for mix in range(3)] == [[1] * 4, [1, 0, 0, 0], [1, 1, 0, 0]]
+    assert [levels.items.arrival_mask(mix).int().tolist() for mix in range(3)] == [[1] * 4, [1, 0, 0, 0], [1, 1, 0, 0]]
     assert not levels_of([{}, {"rotations": 2}]).is_full
     assert levels_of([{"tote_height": 5}]).varies == ("level",)
     assert levels_of([{"tote_height": 2.0}, {}]).entries["tote_height"].tolist() == [[2], [5]]  # 2.0 is a whole number

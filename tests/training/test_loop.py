@@ -13,9 +13,9 @@ from torchrl.modules import ValueOperator
 
 from pickplace import CellSpec, PickPlaceEnv
 from pickplace.algorithms.actor_critic import ActorCritic
-from pickplace.algorithms.base import At
+from pickplace.algorithms.base import BatchPosition
 from pickplace.algorithms.imitation import Imitation, imitation_loss
-from pickplace.common.graphs import PLAIN
+from pickplace.common.graphs import NO_COMPILE
 from pickplace.config.registry import build
 from pickplace.evaluation.play import play
 from pickplace.planners.heuristics import JointDBL
@@ -34,7 +34,7 @@ from pickplace.training.progress import has_passed
 from pickplace.training.trainer import Trainer, episode_metrics, training_env
 
 OBSERVED = ["bin_depth", "tote_depth"]  # by a critic
-AT = At(0, 48, 1, 1000)
+POSITION = BatchPosition(0, 48, 1, 1000)
 
 
 class MeanDepthCritic(nn.Module):
@@ -64,7 +64,7 @@ def collected():
 def test_advantages_by_hand(collected):
     policy, batch = collected[0], collected[1].clone()
     critic = ValueOperator(MeanDepthCritic(), OBSERVED)
-    algorithm_of(policy, critic, "algo.gamma=0.9", "algo.lmbda=0.5", "reward_scale=0.25").prepare(batch, AT)
+    algorithm_of(policy, critic, "algo.gamma=0.9", "algo.lmbda=0.5", "reward_scale=0.25").prepare(batch, POSITION)
     value, following = (0.1 * depth.mean((-2, -1)) for depth in (batch["tote_depth"], batch["next", "tote_depth"]))
     reward, goes_on = 0.25 * collected[1]["next", "reward"][..., 0], ~batch["next", "done"][..., 0]
     assert 0 < goes_on.sum() < goes_on.numel()
@@ -133,7 +133,7 @@ def test_a_step_follows_what_its_phase_learns_from(phase, limit, collected):
     made.lr = step = 1 / min(limit, norm.item())  # so that the parameters move by 1, whatever the limit
     made.optimizer = torch.optim.SGD(made.parameters, lr=1.0)
     objective = made.objective if phase == "reward" else Imitation(made, SimpleNamespace(policy=policy)).objective
-    assert made.descend(data, AT, objective)["train/lr"] == step
+    assert made.descend(data, POSITION, objective)["train/lr"] == step
     for parameter, old, gradient in zip(made.parameters, before, gradients, strict=True):
         moved = gradient * step * min(1, limit / norm)
         torch.testing.assert_close(old - parameter.detach(), moved, rtol=1e-2, atol=1e-5)
@@ -142,10 +142,10 @@ def test_a_step_follows_what_its_phase_learns_from(phase, limit, collected):
 def test_the_learning_rate_falls_linearly_over_the_last_part(collected):
     critic = ValueOperator(MeanDepthCritic(), OBSERVED)
     falling = algorithm_of(collected[0], critic, "algo.lr=0.2", "algo.lr_decay_start=0.75")
-    rates = [falling.learning_rate(At(0, frames, 1, 1000)) for frames in (0, 750, 875, 1000, 1100)]
+    rates = [falling.learning_rate(BatchPosition(0, frames, 1, 1000)) for frames in (0, 750, 875, 1000, 1100)]
     assert rates == pytest.approx([0.2, 0.2, 0.1, 0, 0])
     constant = algorithm_of(collected[0], critic, "algo.lr=0.2", "algo.lr_decay_start=null")
-    assert constant.learning_rate(At(0, 1000, 1, 1000)) == 0.2
+    assert constant.learning_rate(BatchPosition(0, 1000, 1, 1000)) == 0.2
 
 
 def test_a_changed_learning_rate_or_budget_begins_the_schedule_anew(collected, caplog):
@@ -160,15 +160,18 @@ def test_a_changed_learning_rate_or_budget_begins_the_schedule_anew(collected, c
 
     first = algorithm_of(collected[0], critic, "algo.lr=0.2", "algo.lr_decay_start=0.5")
     first.optimizer.step()
-    assert first.learning_rate(At(600, 700, 7, 1000)) == pytest.approx(0.12) and not caplog.messages
-    assert resumed(first, 0.2).learning_rate(At(700, 800, 8, 1000)) == pytest.approx(0.08) and not caplog.messages
+    assert first.learning_rate(BatchPosition(600, 700, 7, 1000)) == pytest.approx(0.12) and not caplog.messages
+    assert (
+        resumed(first, 0.2).learning_rate(BatchPosition(700, 800, 8, 1000)) == pytest.approx(0.08)
+        and not caplog.messages
+    )
     second = resumed(first, 0.1)
-    rates = [second.learning_rate(At(frames, frames + 100, 0, 1000)) for frames in (600, 700, 800, 900)]
+    rates = [second.learning_rate(BatchPosition(frames, frames + 100, 0, 1000)) for frames in (600, 700, 800, 900)]
     assert rates == pytest.approx([0.1, 0.1, 0.1, 0.05])
     assert caplog.messages == ["600 frames: the learning rate is now 0.1, and falls to 0 from 800 to 1,000 frames"]
-    assert resumed(second, 0.1).learning_rate(At(900, 1000, 10, 1000)) == pytest.approx(0.05)
+    assert resumed(second, 0.1).learning_rate(BatchPosition(900, 1000, 10, 1000)) == pytest.approx(0.05)
     longer = resumed(second, 0.1).learning_rate
-    assert [longer(At(frames, frames + 1, 0, 2000)) for frames in (1000, 1750)] == pytest.approx([0.1, 0.05])
+    assert [longer(BatchPosition(frames, frames + 1, 0, 2000)) for frames in (1000, 1750)] == pytest.approx([0.1, 0.05])
 
 
 # --- the loop
@@ -218,7 +221,7 @@ def test_the_slots_of_all_workers_share_the_episodes_of_a_stream():
     curriculum.setup(CellSpec(tote_size=(4, 4, 2)), build("items", cfg["items"]), 100)
     base_env = partial(PickPlaceEnv, tote_size=(4, 4, 2), items=build("items", cfg["items"]), episode_stride=4)
     for first in (0, 2):
-        env = training_env(base_env, curriculum, PLAIN, first_episode=first, num_envs=2)
+        env = training_env(base_env, curriculum, NO_COMPILE, first_episode=first, num_envs=2)
         env.set_seed(0)
         for _ in range(3):
             env.reset()
@@ -245,8 +248,8 @@ def test_a_learner_expects_nothing_after_the_end_of_a_recording(smoke, tmp_path,
     """Though it truncates: nothing more comes, and no critic learns the value of an empty bin."""
     batches, prepare = [], ActorCritic.prepare
 
-    def recording(algorithm, batch, at):
-        data = prepare(algorithm, batch, at)
+    def recording(algorithm, batch, position):
+        data = prepare(algorithm, batch, position)
         batches.append(batch.clone())
         return data
 

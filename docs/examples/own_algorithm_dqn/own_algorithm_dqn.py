@@ -81,9 +81,9 @@ class DQN(Algorithm):
         """Return the policy as it collects."""
         return self.acting
 
-    def learn(self, batch, at):
+    def learn(self, batch, position):
         """Store a batch ``[N, T]``, and take gradient steps on frames of the buffer; return metrics."""
-        left = 1 - at.frames / (self.decay * at.total)
+        left = 1 - position.frames / (self.decay * position.total_frames)
         self.acting.epsilon.fill_(self.epsilon + (1 - self.epsilon) * max(left, 0.0))
         after = batch["next"]
         after["reward"] = self.task.reward_scale * after["reward"]

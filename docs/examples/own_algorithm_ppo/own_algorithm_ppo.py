@@ -16,9 +16,9 @@ class EntropyDecayPPO(PPO):
         super().__init__(*networks, entropy_coeff=entropy_coeff, **settings)
         self.ends = entropy_coeff, last_entropy_coeff
 
-    def learn(self, batch, at):
+    def learn(self, batch, position):
         """Set the coefficient in TorchRL's loss, ``self.loss``, and learn from a batch ``[N, T]`` as PPO does."""
         first, last = self.ends
-        coefficient = first + (last - first) * min(at.before / at.total, 1.0)
+        coefficient = first + (last - first) * min(position.frames_before / position.total_frames, 1.0)
         self.loss.entropy_coeff.fill_(coefficient)
-        return super().learn(batch, at) | {"train/entropy_coeff": coefficient}
+        return super().learn(batch, position) | {"train/entropy_coeff": coefficient}

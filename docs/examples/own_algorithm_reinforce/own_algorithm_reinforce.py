@@ -29,7 +29,7 @@ class Reinforce(Algorithm):
         """Return the policy as it collects: it draws a choice, and writes that and ``action``."""
         return as_collection_policy(self.policy)
 
-    def learn(self, batch, at):
+    def learn(self, batch, position):
         """Take one gradient step on a batch ``[N, T]``; return metrics."""
         returns, data = self.returns(batch).flatten(), batch.reshape(-1)
         baseline = self.critic(data)["state_value"][:, 0]

@@ -20,7 +20,7 @@ class CornersOrHull(Support):
     def stable(self, contact):
         """Return whether items on the grid are stable, bool of the shape of ``contact.z``."""
         enough = (contact.share >= self.share) & contact.is_centre_in_hull()
-        return (contact.corners >= self.corners) | enough
+        return (contact.num_supported_corners >= self.corners) | enough
 
     def measured(self, patches):
         """Return whether items in metres are stable; pickplace adds that the centre is inside the hull."""

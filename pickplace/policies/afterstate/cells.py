@@ -72,7 +72,7 @@ class CellsValue(ToteValue):
         nn.init.normal_(self.head.weight, std=0.01)
         nn.init.constant_(self.head.get_parameter("bias"), 0.5)
 
-    def some_parts(self, *entries: Tensor) -> Tensor:
+    def chunk_parts(self, *entries: Tensor) -> Tensor:
         """Return the volume that each cell will still take, scaled, float32 ``[N, W_T, D_T]``.
 
         Args:

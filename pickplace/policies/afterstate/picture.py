@@ -35,7 +35,7 @@ class PictureValue(ToteValue):
     """
 
     in_keys = ("tote_depth", "tote_height", "items")
-    looks: Tensor
+    cell_planes: Tensor
 
     def __init__(
         self,
@@ -60,9 +60,9 @@ class PictureValue(ToteValue):
         self.head = nn.Linear(hidden, 1)
         nn.init.normal_(self.head.weight, std=0.01)
         nn.init.constant_(self.head.bias, 0.5)
-        self.register_buffer("looks", looks(steps), persistent=False)
+        self.register_buffer("cell_planes", cell_planes(steps), persistent=False)
 
-    def some_parts(self, *entries: Tensor) -> Tensor:
+    def chunk_parts(self, *entries: Tensor) -> Tensor:
         """Return the values, ``[N, 1]``, one part each, of totes ``[N, W_T, D_T]`` with heights ``[N, 1]`` and waiting
         items ``[N, M, 5]``."""
         depth, height, items = entries
@@ -84,7 +84,7 @@ class PictureValue(ToteValue):
     def learning_bytes(self, wide: int, deep: int) -> int:
         return 8 * (wide * deep + self.cells(wide, deep) * (self.grid[2] + 3 + self.around.out_channels))
 
-    def may_turn(self, wide: int, deep: int) -> bool:
+    def can_transpose(self, wide: int, deep: int) -> bool:
         return wide == deep and self.grid[0] == self.grid[1]
 
     def _scale(self, depth: Tensor, height: Tensor) -> Tensor:
@@ -96,7 +96,7 @@ class PictureValue(ToteValue):
 
     @torch.no_grad()
     def _picture(self, depth: Tensor, height: Tensor) -> Tensor:
-        """Return pictures, int32 ``[N, *grid[:2]]``: for each cell the row of :func:`looks`. Walls are edges."""
+        """Return pictures, int32 ``[N, *grid[:2]]``: for each cell the row of :func:`cell_planes`. Walls are edges."""
         wide, deep, steps = self.grid
         if depth.shape[1:] != (wide, deep):
             depth = -F.adaptive_max_pool2d(-depth[:, None], (wide, deep))[:, 0]
@@ -109,7 +109,7 @@ class PictureValue(ToteValue):
 
     def _planes(self, picture: Tensor, dtype: torch.dtype) -> Tensor:
         """Return the planes of a picture, ``[N, planes, *grid[:2]]``, channels last."""
-        return F.embedding(picture, self.looks).to(dtype).permute(0, 3, 1, 2)
+        return F.embedding(picture, self.cell_planes).to(dtype).permute(0, 3, 1, 2)
 
     def _around_by_table(self, picture: Tensor) -> Tensor:
         """Return the output of the first convolution, ``[N, filters, *grid[:2]]``, channels last: for each cell the sum
@@ -117,9 +117,9 @@ class PictureValue(ToteValue):
         weight, (wide, deep, _) = self.around.weight, self.grid
         side = weight.shape[-1]
         margin = side // 2
-        table = self.looks @ weight.permute(2, 3, 1, 0)  # [side, side, looks, filters]
+        table = self.cell_planes @ weight.permute(2, 3, 1, 0)  # [side, side, rows, filters]
         table[margin, margin] += self.around.get_parameter("bias")  # with the cell itself, which is never outside
-        begins = torch.arange(side**2, dtype=torch.int32) * len(self.looks)
+        begins = torch.arange(side**2, dtype=torch.int32) * len(self.cell_planes)
         padded = F.pad(picture, [margin] * 4)
         around = [padded[:, x : x + wide, y : y + deep] for x in range(side) for y in range(side)]
         terms = torch.stack(around, -1).view(-1, side**2).add_(begins)
@@ -127,7 +127,7 @@ class PictureValue(ToteValue):
         return x.view(-1, wide, deep, x.shape[1]).permute(0, 3, 1, 2)
 
 
-def looks(steps: int) -> Tensor:
+def cell_planes(steps: int) -> Tensor:
     """Return the planes of all cells that a picture can have, float32 ``[1 + 4 * (steps + 1), steps + 3]``.
 
     Row 0 is a cell outside the tote. Row ``1 + 4 * above + 2 * x + y`` is a cell that is ``above`` steps high; x and y

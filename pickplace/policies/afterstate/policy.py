@@ -57,7 +57,7 @@ class Afterstate(FootprintPolicy):
         left = remove_item(self.cell, items_from_observation(observation), choice // self.cell.num_footprints)
         return seen_items(left, coming_from_observation(observation))
 
-    def judge(self, before: State, choice: Tensor) -> tuple[State, Tensor, Tensor]:
+    def evaluate_choices(self, before: State, choice: Tensor) -> tuple[State, Tensor, Tensor]:
         after, item = put_down(self.cell, before, choice)
         seen = observe({**STANDARD_TERMS, "items": SeenItems()}, self.cell, after, self.network.in_keys)
         value = self.network(*(seen[key] for key in self.network.in_keys))[:, 0]
@@ -66,7 +66,7 @@ class Afterstate(FootprintPolicy):
     def scores(self, observation: Observation, row: Tensor, footprint: Tensor) -> Tensor:
         state = State.from_observation(observation)._replace(pile=None)  # the networks do not see piles
         before = state.rows(row)
-        _, volume, value = self.judge(before, footprint)
+        _, volume, value = self.evaluate_choices(before, footprint)
         less = before.items.volume.amax(1) - volume  # relative to the largest item: exactly 0 with one in the bin
         return (value - self.network.reward_scale * less) / self.temperature
 

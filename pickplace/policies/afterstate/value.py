@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from pickplace.common.recording import is_recording
+from pickplace.common.capture import is_capturing
 from pickplace.common.validate import flag, number, one_of
 from pickplace.policies.dtypes import DTYPES
 
@@ -50,8 +50,8 @@ class ToteValue(nn.Module, ABC):
         if self.training or not (self.mirrored and self.all_views):
             return self.parts(*flat).flatten(1).sum(1).view(*batch, 1)
         means = []
-        for turned in (False, True) if self.may_turn(wide, deep) else (False,):
-            views = zip(*(seen_from(flat, axes, turned) for axes in FLIPS), strict=True)
+        for turned in (False, True) if self.can_transpose(wide, deep) else (False,):
+            views = zip(*(flip_and_transpose(flat, axes, turned) for axes in FLIPS), strict=True)
             values = self.parts(*(torch.cat(entry) for entry in views)).flatten(1).sum(1)
             means.append(values.view(len(FLIPS), -1).mean(0))
         return torch.stack(means).mean(0).view(*batch, 1)
@@ -61,16 +61,16 @@ class ToteValue(nn.Module, ABC):
         device, (wide, deep) = entries[0].device.type, entries[0].shape[1:]
         at_once = max(1, self.cells_at_once.get(device, self.cells_at_once["cpu"]) // self.cells(wide, deep))
         if torch.is_grad_enabled() or len(entries[0]) <= at_once:
-            return self.some_parts(*entries)
+            return self.chunk_parts(*entries)
         some = zip(*(entry.split(at_once) for entry in entries), strict=True)
-        return torch.cat([self.some_parts(*each) for each in some])
+        return torch.cat([self.chunk_parts(*each) for each in some])
 
     def cells(self, wide: int, deep: int) -> int:
         """Return the number of cells that the network looks at in a tote of ``wide x deep``."""
         return wide * deep
 
     @abstractmethod
-    def some_parts(self, *entries: Tensor) -> Tensor:
+    def chunk_parts(self, *entries: Tensor) -> Tensor:
         """Return :meth:`parts` for totes that are few enough to compute at once."""
 
     @abstractmethod
@@ -89,29 +89,29 @@ class ToteValue(nn.Module, ABC):
         """Return maps mirrored and transposed at random, as far as the value stays the same.
 
         Args:
-            maps: as in :func:`seen_from`.
+            maps: as in :func:`flip_and_transpose`.
         """
         if not self.mirrored:
             return maps
         wide, deep = maps[0].shape[1:]
-        draws = torch.rand(3, device=maps[0].device if is_recording() else None) < 0.5
-        if is_recording():  # the device selects among all views, which must have one shape
+        draws = torch.rand(3, device=maps[0].device if is_capturing() else None) < 0.5
+        if is_capturing():  # the device selects among all views, which must have one shape
             views: list[tuple[list[int], bool]] = [([1], False), ([2], False), ([], True)]
             for (axes, turned), drawn in zip(views, draws.roll(-1), strict=True):
-                if not turned or (wide == deep and self.may_turn(wide, deep)):
-                    pairs = zip(maps, seen_from(maps, axes, turned), strict=True)
+                if not turned or (wide == deep and self.can_transpose(wide, deep)):
+                    pairs = zip(maps, flip_and_transpose(maps, axes, turned), strict=True)
                     maps = tuple(torch.where(drawn, new, old) for old, new in pairs)
             return maps
         turned, *flips = draws.tolist()
         axes = [axis for axis, flipped in zip((1, 2), flips, strict=True) if flipped]
-        return seen_from(maps, axes, turned and self.may_turn(wide, deep))
+        return flip_and_transpose(maps, axes, turned and self.can_transpose(wide, deep))
 
-    def may_turn(self, wide: int, deep: int) -> bool:
+    def can_transpose(self, wide: int, deep: int) -> bool:
         """Return whether a tote of these sides may be transposed."""
         return True
 
 
-def seen_from(entries: Sequence[Tensor], axes: list[int], turned: bool) -> tuple[Tensor, ...]:
+def flip_and_transpose(entries: Sequence[Tensor], axes: list[int], turned: bool) -> tuple[Tensor, ...]:
     """Return the entries with all maps ``[N, W_T, D_T]`` flipped along axes, then transposed if ``turned``.
 
     In tables of items, int64 ``[N, M, 5]``, ``turned`` exchanges x and y. Entries with another number of dimensions are

@@ -138,7 +138,7 @@ class Conv4dNet(nn.Module):
             bins = windows[row, pick // deep, pick % deep]
         if torch.compiler.is_exporting():  # in one piece: the number of pieces would depend on the sizes
             out = self._logits(bins, totes)
-        elif pick is None and self._by_tiles(bins, totes):  # a single pick is faster without tiles
+        elif pick is None and self._uses_tiles(bins, totes):  # a single pick is faster without tiles
             out = self._logits_by_tiles(bins, totes)
         else:
             out = self._logits_by_chunks(bins, totes)
@@ -228,7 +228,7 @@ class Conv4dNet(nn.Module):
         out = convolve(0, self.second.bias.to(self._dtype)).add_(convolve(1)).add_(convolve(2))
         return out.relu_().permute(0, 2, 3, 4, 1).unflatten(0, (rows, bins.shape[0]))
 
-    def _by_tiles(self, bins: Tensor, totes: Tensor) -> bool:
+    def _uses_tiles(self, bins: Tensor, totes: Tensor) -> bool:
         """Return whether to use minimal filtering: where it is faster, and not with gradients, for which it holds more
         memory."""
         if bins.device.type != "cpu" or torch.is_grad_enabled() or torch.is_autocast_enabled("cpu"):

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from pickplace.common.recording import is_recording
+from pickplace.common.capture import is_capturing
 from pickplace.policies.base import MASKED, ActionPolicy
 from pickplace.policies.fcn4d.network import Conv4dNet
 from pickplace.rules.cell import CellSpec
@@ -30,7 +30,7 @@ class Conv4dPolicy(ActionPolicy):
 
     def action_scores(self, observation: Observation, mask: Tensor | None = None) -> Tensor:
         maps, rotations = (observation["bin_depth"], observation["tote_depth"]), self.cell.rotations
-        if mask is None or is_recording():
+        if mask is None or is_capturing():
             every = self.network(*maps).unflatten(1, (-1, 4))[..., :rotations].flatten(1)
             return every if mask is None else torch.where(mask, every, MASKED)
         # Most logits are not needed, nor is most of the arithmetic. In a small tote few places are feasible for a pick.

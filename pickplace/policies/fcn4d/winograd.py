@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-MOST_OUTPUTS = 6  # of a tile along one axis; more points lose digits
+MAX_OUTPUTS = 6  # of a tile along one axis; more points lose digits
 POINTS = (0.0, 1.0, -1.0, 0.5, -0.5, 2.0, -2.0)  # where polynomials are evaluated, beside infinity
 
 
@@ -26,7 +26,7 @@ def filtering(outputs: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return the matrices of minimal filtering: ``last @ ((kernel @ taps) * (first @ inputs))`` is the convolution.
 
     Args:
-        outputs: ``m``, from 1 to :data:`MOST_OUTPUTS`.
+        outputs: ``m``, from 1 to :data:`MAX_OUTPUTS`.
 
     Returns:
         kernel: ``[m + 2, 3]``; float64, as the others.
@@ -48,7 +48,7 @@ class Tiles:
     """An axis with ``length`` outputs, cut into ``count`` tiles of ``size``."""
 
     def __init__(self, length: int):
-        self.length, self.count = length, math.ceil(length / MOST_OUTPUTS)
+        self.length, self.count = length, math.ceil(length / MAX_OUTPUTS)
         self.size = math.ceil(length / self.count)
 
     def cut(self, maps: Tensor, dim: int) -> Tensor:

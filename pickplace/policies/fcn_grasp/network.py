@@ -5,7 +5,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pickplace.common.validate import MAX_WIDTH, check_inputs, number, odd_number, one_of, whole_numbers
-from pickplace.policies.depth import Contents, clip_depth
+from pickplace.policies.depth import ScoredItems, clip_depth
 from pickplace.policies.dtypes import DTYPES, matrix_dtype
 from pickplace.rules.grasps import split_footprint
 from pickplace.rules.gripper.base import reference_cell
@@ -87,9 +87,9 @@ class FootprintFcn(nn.Module):
         nn.init.normal_(self.head.weight, std=head_std)
         nn.init.zeros_(self.head.bias)
 
-    def at(
+    def footprint_scores(
         self, bin_depth: Tensor, tote_depth: Tensor, bearing: Tensor, row: Tensor, footprint: Tensor,
-        contents: Contents,
+        contents: ScoredItems,
     ) -> Tensor:  # fmt: skip
         """Return the scores of the given footprints, float32 ``[M, out_channels]``.
 
@@ -104,7 +104,7 @@ class FootprintFcn(nn.Module):
         if not torch.is_grad_enabled() and len(row) > at_once:  # large totes: a part at a time, to save memory
             split = (index.split(at_once) for index in (row, footprint, contents.number))
             parts = ((*part, contents._replace(number=number)) for *part, number in zip(*split, strict=True))
-            return torch.cat([self.at(bin_depth, tote_depth, bearing, *part) for part in parts])
+            return torch.cat([self.footprint_scores(bin_depth, tote_depth, bearing, *part) for part in parts])
         dtype, count = matrix_dtype(self.compute_dtype, tote_depth.device.type), row.shape[0]
         lower = dtype != torch.float32
         if lower:

@@ -5,7 +5,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from pickplace.policies.base import MAP_KEYS, MASKED, Policy, pick_one, refuse_several_items
-from pickplace.policies.depth import Contents
+from pickplace.policies.depth import ScoredItems
 from pickplace.policies.fcn_grasp.network import FootprintFcn
 from pickplace.policies.footprints import FOOTPRINT_INDEX, FootprintPolicy, every_footprint
 from pickplace.rules.cell import CellSpec
@@ -80,8 +80,8 @@ class UnmaskedFcnGrasp(Policy):
         """Return a logit for every (grasp class, place cell), ``[N, C, W_T * D_T]``."""
         bins, totes, bearing = (observation[key] for key in MAP_KEYS)
         row, footprint = every_footprint(totes, self.cell.footprint_turns)
-        contents = Contents(items_from_observation(observation), torch.zeros_like(row))
-        scores = self.network.at(bins, totes, bearing, row, footprint, contents).view(len(totes), -1)
+        contents = ScoredItems(items_from_observation(observation), torch.zeros_like(row))
+        scores = self.network.footprint_scores(bins, totes, bearing, row, footprint, contents).view(len(totes), -1)
         return torch.cat([scores, self.outside.expand(len(scores), 1)], 1)[:, self.scored]
 
     def _choices(self, observation: Observation) -> tuple[Tensor, Tensor, Tensor]:

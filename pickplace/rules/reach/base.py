@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pickplace.common.recording import constant_on
+from pickplace.common.capture import constant_on
 from pickplace.rules.checks import is_within_reach
 from pickplace.rules.maps import FAR, NEVER
 
@@ -71,7 +71,7 @@ class Limits(Reach):
                 found = "None" if table is None else f"{table.dtype} of shape {[*table.shape]}"
                 raise ValueError(f"limits.{name}: got {found}, expected {kind} of shape {shape}.")
 
-    def on(self, device) -> "Limits":
+    def to(self, device) -> "Limits":
         """Return the tables on a device."""
         tables = {name: table for name, table in vars(self).items() if table is not None}
         return replace(self, **{name: constant_on(table, torch.device(device)) for name, table in tables.items()})

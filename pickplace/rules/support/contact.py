@@ -71,21 +71,21 @@ class Contact:
         """The supported share of the footprint, float64 of the shape of ``z``."""
         return self.count.double() / (self.w * self.d)
 
-    def at_corners(self) -> Iterator[Tensor]:
+    def corner_surfaces(self) -> Iterator[Tensor]:
         """Yield the surface of the cell in each of the footprint's four corners, int32 of the shape of ``z``."""
         along_x, along_y = ((0 * size, size.clamp(1, self.side) - 1) for size in (self.w, self.d))
         for x, y in product(along_x, along_y):
             yield self.surfaces.gather(0, (x * self.side + y).expand_as(self.z)[None])[0]
 
     @property
-    def corners(self) -> Tensor:
+    def num_supported_corners(self) -> Tensor:
         """The number of the footprint's corners that are supported, 0 to 4; one cell may have several corners."""
-        return torch.stack([surface == self.supporting for surface in self.at_corners()]).sum(0, dtype=torch.int32)
+        return torch.stack([surface == self.supporting for surface in self.corner_surfaces()]).sum(0, dtype=torch.int32)
 
     @property
-    def level_corners(self) -> Tensor:
+    def num_level_corners(self) -> Tensor:
         """The number of the footprint's corners whose cells are as high as the highest of them, supported or not."""
-        heights = torch.stack([*self.at_corners()]) >> 1
+        heights = torch.stack([*self.corner_surfaces()]) >> 1
         return (heights == heights.amax(0)).sum(0, dtype=torch.int32)
 
     def is_centre_in_hull(self, margin: float = 0.0) -> Tensor:
@@ -163,7 +163,7 @@ class Contact:
                 most = torch.where(slope > most, slope, most)
         return ~before & (least < most)
 
-    def in_hull(self) -> Tensor:
+    def hull_mask(self) -> Tensor:
         """Return a mask of the cells under the items inside the hull of the supporting cells, bool ``[S * S, N]``.
 
         Valid only for one footprint of each problem, with ``surfaces`` in one tensor. The hull is followed on its far
@@ -267,7 +267,7 @@ class Patches:
             self._inside[margin] = (supports.double() @ (along > margin).double().t() > 0).all(-1)
         return self._inside[margin]
 
-    def in_hull(self) -> Tensor:
+    def hull_mask(self) -> Tensor:
         """Return a mask of the patches inside the hull of what carries the item, bool ``[patches]``; of one place.
 
         With an error, the item may not reach a patch at its edge. If it does, it reaches all patches of the same row

@@ -73,7 +73,7 @@ class Corners(Share):
     least: float = field(default=0.95, init=False)
 
     def stable(self, contact: Contact) -> Tensor:
-        corners, share = contact.corners, contact.share
+        corners, share = contact.num_supported_corners, contact.share
         return super().stable(contact) | ((corners >= 4) & (share >= 0.6)) | ((corners >= 3) & (share >= 0.8))
 
 
@@ -89,9 +89,9 @@ class Cdrl(Share):
     least: float = field(default=nextafter(0.95, 1), init=False)  # the next number after 0.95
 
     def stable(self, contact: Contact) -> Tensor:
-        corners, share = contact.corners, contact.share
+        corners, share = contact.num_supported_corners, contact.share
         # If over 95% of up to 40 cells are supported, so is some corner: the highest corners are supported ones.
-        level = corners if contact.side <= 6 else contact.level_corners
+        level = corners if contact.side <= 6 else contact.num_level_corners
         found = super().stable(contact) & (level >= 3)
         return found | ((corners >= 4) & (share > 0.5)) | ((corners >= 3) & (share > 0.85))
 
@@ -137,7 +137,7 @@ class Bearing(Hull):
     """
 
     def bearing(self, contact: Contact) -> Tensor:
-        return contact.in_hull()
+        return contact.hull_mask()
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ class RoundedUp(Bearing):
     """
 
     def stable(self, contact: Contact) -> Tensor:
-        return super().stable(contact) | (contact.corners >= 4)
+        return super().stable(contact) | (contact.num_supported_corners >= 4)
 
 
 #: The rules that a short form names; a number is the least share.

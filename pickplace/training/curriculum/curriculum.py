@@ -86,7 +86,7 @@ class Curriculum:
         return self.tally.level
 
     @property
-    def what(self) -> str:
+    def level_name(self) -> str:
         """Name of a level to show: ``tote height`` if levels are heights, else ``level``."""
         return self.levels.key.replace("_", " ")
 
@@ -176,7 +176,7 @@ class Curriculum:
         if level != tally.level:
             if not (tally.episodes or self.weights):
                 keys = "more frames for it (curriculum.advance), or a smaller env.num_envs"
-                log.warning("no episode at %s %d has ended; expected %s.", self.what, tally.level, keys)
+                log.warning("no episode at %s %d has ended; expected %s.", self.level_name, tally.level, keys)
             self.tally = Tally(level, deque(maxlen=self.advance.window), frames, level_start=frames)
         return {f"curriculum/{key}": value for key, value in logs.items()}
 

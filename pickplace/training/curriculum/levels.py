@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import at_most, expect, reworded
+from pickplace.common.validate import expect, refuse_above, reword_errors
 from pickplace.envs.checks import check_items
 from pickplace.envs.episode import RESET_ENTRIES, SETTINGS
 from pickplace.items.distributions import ItemDistribution
@@ -63,7 +63,7 @@ def read_levels(given: Sequence[Mapping], cell: CellSpec, items: ItemDistributio
     """
     good = isinstance(given, Sequence) and given and all(isinstance(level, Mapping) for level in given)
     expect(good, "curriculum.levels", given, "a list of mappings, such as [{tote_height: 2}, {}]")
-    at_most("curriculum.levels: the list has", len(given), "levels", MAX_LEVELS)
+    refuse_above("curriculum.levels: the list has", len(given), "levels", MAX_LEVELS)
     check_keys(given)
     places = [f"curriculum.levels[{number}]" for number in range(len(given))]
     mixes: list[Mapping] = []
@@ -97,4 +97,4 @@ def read_levels(given: Sequence[Mapping], cell: CellSpec, items: ItemDistributio
 
 def _prefixed(place: str):
     """Add the place of a level to an error."""
-    return reworded(ValueError, lambda error: ValueError(f"{place}: {error}"))
+    return reword_errors(ValueError, lambda error: ValueError(f"{place}: {error}"))

@@ -16,7 +16,7 @@ def test_a_table_of_another_shape_or_type_is_refused(table):
     tables = {"pick_ok": torch.ones(20, dtype=torch.bool), "lowest_top": places, "highest_top": places + 5}
     tables |= {"lowest_pick": torch.zeros(20).int(), "highest_pick": torch.ones(20).int()}
     sizes = {"bin_size": (4, 5, 1), "tote_size": (6, 7, 5), "rotations": 2}
-    assert CellSpec(**sizes, reach=Limits(**tables)).limits.on("cpu").highest_top.equal(places + 5)
+    assert CellSpec(**sizes, reach=Limits(**tables)).limits.to("cpu").highest_top.equal(places + 5)
     kind = "bool" if table == "pick_ok" else "integers"
     for bad, words in (
         (tables[table][:-1], r"got .* of shape \[.*\], expected .* of shape \["),

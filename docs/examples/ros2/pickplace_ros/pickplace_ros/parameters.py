@@ -7,7 +7,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.exceptions import ParameterException
 
 from pickplace import Planner
-from pickplace.common.validate import refuse_if, reworded
+from pickplace.common.validate import refuse_if, reword_errors
 from pickplace.robot.box import ACCURACY, CLEARANCE
 from pickplace.serve.options import load_planner, plan_once, planner_options
 from pickplace.serve.request import DEADLINE, MAX_DEADLINE
@@ -68,7 +68,7 @@ def declare(node) -> dict[str, Any]:
             descriptor.floating_point_range = [FloatingPointRange(from_value=least, to_value=most)]
         elif least is not None:
             descriptor.integer_range = [IntegerRange(from_value=least, to_value=most, step=1)]
-        with reworded(ParameterException, lambda error: ValueError(str(error))):
+        with reword_errors(ParameterException, lambda error: ValueError(str(error))):
             value = node.declare_parameter(name, default, descriptor).value
         value = list(value) if isinstance(default, list) else value
         refuse_if(value == "" and null is None, f"{name}: empty; expected {description}.")
@@ -85,7 +85,7 @@ def load(values: dict[str, Any]) -> Planner:
     options = {name.lstrip("-").replace("-", "_"): option for name, option in planner_options().items()}
     given = {name: option.get("default") for name, option in options.items()}
     given |= {name: value for name, value in values.items() if name in options}
-    with reworded(ValueError, lambda error: ValueError(str(error).replace("--", ""))):
+    with reword_errors(ValueError, lambda error: ValueError(str(error).replace("--", ""))):
         planner, _ = load_planner(Namespace(**given))
     plan_once(planner)
     return planner
