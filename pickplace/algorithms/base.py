@@ -97,7 +97,7 @@ class Algorithm(ABC):
         matching_state(state, self.state_dict(), "algorithm")
 
     def memory(self, frame: int) -> dict[str, int]:
-        """Return the bytes that learning takes at once, by the setting, ``key=value``, that causes them.
+        """Return the bytes that learning needs at one time, each under the setting that causes them, ``key=value``.
 
         Args:
             frame: bytes of one collected frame.
@@ -127,7 +127,7 @@ class Imitable(Protocol):
         """Return the bytes of a gradient step, by its setting, if each frame takes ``frame`` bytes."""
 
 
-#: Entries of an optimizer's state that count or sum squares.
+#: Entries of an optimizer's state that cannot be negative: numbers of steps, and sums or means of squares.
 NOT_NEGATIVE = ("step", "exp_avg_sq", "max_exp_avg_sq", "square_avg", "sum")
 
 

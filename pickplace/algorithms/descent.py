@@ -143,12 +143,9 @@ class MinibatchDescent(Algorithm):
         raise FloatingPointError(f"the loss or its gradient is not finite: {ranges}; expected a smaller algo.lr.")
 
     def learning_rate(self, position: BatchPosition) -> float:
-        """Return the learning rate of a batch; if it falls, a new run's last batch has 0."""
-        falls = (
-            ""
-            if self.lr_decay_start is None
-            else f" lr_decay_start={self.lr_decay_start} total_frames={position.total_frames}"
-        )
+        """Return the learning rate of a batch. With ``lr_decay_start`` a new run reaches 0 in its last batch."""
+        falls = f" lr_decay_start={self.lr_decay_start} total_frames={position.total_frames}"
+        falls = "" if self.lr_decay_start is None else falls
         before, now = self.schedule["settings"], f"lr={self.lr}{falls}"
         if before != now:
             self.schedule = {"settings": now, "since": position.frames_before if before else 0}

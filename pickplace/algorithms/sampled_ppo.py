@@ -79,9 +79,9 @@ class SampledPPO(PPO):
 
         A state's value is the weighted mean over its candidates. The weights of a state have a mean of 1 here, so that
         the loss, an unweighted mean over candidates, is an expectation under the policy that drew them. There is one
-        exception: a candidate that is better than expected has the square root of its weight, if that is more. By the
-        expectation alone a rare choice would stay rare for long, however good it is; in a natural gradient (Kakade
-        2002) its step would not depend on its probability at all.
+        exception: a candidate with a positive advantage and a weight below 1 has the square root of its weight. By the
+        expectation alone a good but rare choice would stay rare for long; in a natural gradient (Kakade 2002) its step
+        would not depend on its probability at all.
 
         Args:
             frames: observations, candidates and, in ``next``, what the taken choices led to, ``[B]``.
@@ -135,9 +135,9 @@ def taken_choice_advantages(advantage: Tensor, candidates: int, normalize: bool)
 
 
 def _arrivals(frames: TensorDictBase) -> Item:
-    """Return an item for each frame, ``[B, 1]``: one that arrived after a random success in the batch.
+    """Draw an item for each frame, ``[B, 1]``, from those that arrived after the batch's successful actions.
 
-    It is the frame's own item without any success, or if the drawn item is of an episode with other items or rotations.
+    A frame keeps its own item if no action succeeded, or if the drawn item's episode has other items or rotations.
     """
     after = frames["next"]
     placed = (after["failure"] == Failure.NONE) | (after["failure"] == Failure.STUCK)

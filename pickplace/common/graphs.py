@@ -109,7 +109,7 @@ class CapturedWork:
 class CaptureChecker(TorchDispatchMode):
     """Finds operations that a CUDA graph cannot hold: those that read results back, or whose shapes depend on data.
 
-    On a CPU, ``tolist`` and ``numpy`` are not seen; a GPU copies for them, which is.
+    On a CPU, calls of ``tolist`` and ``numpy`` go unnoticed. On a GPU they are found, as they copy to the CPU.
 
     Attributes:
         places: the operations, each with the line of pickplace or of the user that called it.

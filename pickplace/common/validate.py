@@ -66,7 +66,7 @@ def refuse_any(found: Iterable, message: Callable[[Any], str], error: type[Excep
 
 
 def unique_keys(pairs: list[tuple[str, Any]]) -> dict:
-    """Return an object of a JSON text; refuse a repeated key, as readers differ in which value counts."""
+    """Return a JSON object as a dict. Refuse a key that occurs twice: parsers disagree on which value to keep."""
     found: dict = {}
     for key, value in pairs:
         refuse_if(key in found, f"{excerpt(key)} stands twice in an object; expected each key once.")

@@ -23,9 +23,9 @@ from pickplace.common.validate import excerpt, refuse_any, refuse_if
 from pickplace.config.allowlist import walk
 from pickplace.config.registry import REGISTRY, names_at
 
-#: Groups whose settings in a preset belong to the experiment. Another option on the command line keeps them: all of
-#: ``KEPT``, and of ``SHARED`` the plain values that this option has, too, such as ``algo.lr``.
-KEPT, SHARED = ("env", "evaluation"), ("algo", "model")
+#: Groups whose preset values stay when the command line chooses another option: in the first all values, in the second
+#: plain values under keys that the new option also has, such as ``algo.lr``.
+KEPT_GROUPS, SHARED_GROUPS = ("env", "evaluation"), ("algo", "model")
 
 #: Keys of Hydra that users of the commands set.
 HYDRA_KEYS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.searchpath", "hydra.verbose")
@@ -232,18 +232,18 @@ def refuse_unknown_keys(cfg: DictConfig, known: DictConfig, path: str = "") -> N
 
 
 def own_values(cfg: DictConfig) -> DictConfig:
-    """Return the config of this run, in which an option chosen on the command line has no values meant for others.
+    """Return the config of this run without preset values that were meant for an option that another one replaced.
 
     A preset, or a config file of the user, sets values for the option that it expects, such as
     ``curriculum.advance.occupancy`` for ``threshold``. Hydra merges them into the option that the command line chose
     instead. Here, an option that replaces another one gets the values of its own files and of the command line only.
-    :data:`KEPT` and :data:`SHARED` are exceptions.
+    :data:`KEPT_GROUPS` and :data:`SHARED_GROUPS` are exceptions.
     """
     running = HydraConfig.get()
     search = search_words(running.overrides.hydra)
     given = [(override, *_package_and_places(override, search)) for override in parse(task_overrides())]
     choices = [(each, places) for each, package, places in given if package and not each.is_delete()]
-    pairs = [(place, choice) for choice, places in choices for place in places if place not in KEPT]
+    pairs = [(place, choice) for choice, places in choices for place in places if place not in KEPT_GROUPS]
     for place, choice in sorted(pairs, key=lambda pair: pair[0].count(".")):  # outer parts before inner ones
         if OmegaConf.select(cfg, place) is None:
             continue
@@ -263,7 +263,7 @@ def own_values(cfg: DictConfig) -> DictConfig:
         group = choice.get_key_element().lstrip("+~")  # as Hydra lists it, such as planner@warm_start.teacher
         if str(before.hydra.runtime.choices.get(group)) != str(choice.value()):
             cfg = cfg.copy()
-            if place in SHARED:
+            if place in SHARED_GROUPS:
                 merged = _part_at(cfg, place)
                 plain = [key for key in own if not isinstance(own[key], dict) and not isinstance(merged[key], dict)]
                 own |= {key: merged[key] for key in plain if key != "_target_"}

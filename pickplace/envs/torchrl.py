@@ -200,8 +200,8 @@ class PickPlaceEnv(EnvBase):
         """Reset all problems, or those in ``_reset``; the others are returned unchanged.
 
         There are no other arguments: ``set_seed`` begins another item stream. TorchRL would fill the other rows with
-        zeros if ``tensordict`` has only ``_reset``, and copy every mask cell by cell if it has more. But all that an
-        agent sees of them is still here.
+        zeros if ``tensordict`` has only ``_reset``, and copy every mask cell by cell if it has more. Neither is
+        needed: the environment still holds their observations.
         """
         if tensordict is None or "_reset" not in tensordict:
             return super().reset(tensordict, **kwargs)

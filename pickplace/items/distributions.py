@@ -224,7 +224,10 @@ class Kinds(ItemDistribution):
 
     @staticmethod
     def _edges_of(share: Tensor) -> Tensor:
-        """Return the limits between the kinds, of mix ``m`` in ``[m, m + 1)``, for all mixes, ``[mixes * (K - 1)]``."""
+        """Return the cumulative frequencies that separate the kinds, one mix after the other, ``[mixes * (K - 1)]``.
+
+        Those of mix ``m`` are shifted by ``m``, so that one search serves all mixes.
+        """
         edges = (share.cumsum(1) / share.sum(1, keepdim=True))[:, :-1]
         return (edges + torch.arange(len(edges))[:, None]).flatten()
 

@@ -113,7 +113,7 @@ class Policy(TensorDictModuleBase, ABC):
         return self.logits(observation).gather(1, choices)
 
     def to_action(self, choice: Tensor, observation: Observation) -> Tensor:
-        """Return a flat action for each choice, int64 ``[N]``: drawn evenly if exploring, else its class's lowest."""
+        """Return a flat action of each choice's class, ``[N]``: drawn uniformly if exploring, else the lowest one."""
         return choice
 
     def to_choice(self, action: Tensor, observation: Observation) -> Tensor:

@@ -123,7 +123,7 @@ def _likely(seen: Heights, room: Room, margin: float, shape: np.ndarray) -> Tote
 
 
 def _behind_holes(seen: Heights, room: Room, margin: float, accuracy: float, shape: np.ndarray) -> np.ndarray:
-    """Return a mask of the unknown patches: a thing on a surface there would show only in a hole; bool ``shape``.
+    """Return a mask of the patches where a hole in the image could hide a thing on a surface, bool ``shape``.
 
     The rays of the hole's pixels are followed up to the rim, as the surface itself may not be seen.
     """

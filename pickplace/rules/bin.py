@@ -172,8 +172,10 @@ def is_below_limit(items: Item, settings: EpisodeSettings) -> Tensor:
 
 
 def admit_coming_items(cell: CellSpec, state: State) -> tuple[State, Tensor]:
-    """Return the state after the items of the preview have arrived, as far as the bins have room, and the bins in
-    which an item that is not seen yet arrives next, bool ``[N]``.
+    """Add the items of the preview to the bins, as far as these have room.
+
+    Returns:
+        The new state, and a mask of the bins in which an item outside the preview arrives next, bool ``[N]``.
 
     In an empty bin an item lies at its own place, as in the environment. In any other bin it lies at the first free
     place; the environment draws one at random.

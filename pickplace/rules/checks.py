@@ -28,7 +28,7 @@ _COMBINE = {PICK: and_, FOOTPRINT: and_, LEAST_TOP: torch.maximum, GREATEST_TOP:
 class Resting(NamedTuple):
     """Items at rest on footprints."""
 
-    inside: Tensor | None  # whether the footprint is in the tote; None: the top is above any rim outside of it
+    inside: Tensor | None  # whether the footprint is in the tote; None: ``top`` is above any rim where it is not
     top: Tensor  # height of the item's top
     rim: Tensor | int  # height of the tote
     stable: Tensor

@@ -202,16 +202,16 @@ def select_pick(cell: CellSpec, actions: Tensor, pick: Tensor) -> Tensor:
 
 # ---------------------------------------------------------------------- grasp classes
 def num_turns(cell: CellSpec) -> int:
-    """Return the number of distinct turns; the turn of a rotation is its remainder.
+    """Return the number ``T`` of distinct turns; rotation ``r`` has the turn ``r % T``.
 
-    Turns are rotations if limits may apply to a rotation but not to its half turn, or a half turn changes the body.
-    Else they are quarter turns.
+    Each rotation is a turn of its own if the robot has limits, or an item may forbid a rotation. Else see
+    :func:`num_grasp_turns`.
     """
     return num_grasp_turns(cell) if cell.limits is None and not cell.forbids_turns else cell.rotations
 
 
 def num_grasp_turns(cell: CellSpec) -> int:
-    """Return the number of distinct turns without limits on rotations."""
+    """Return the number of distinct turns without limits: more than two if a half turn changes the body."""
     return max(cell.footprint_turns, len(cell.effectors))
 
 

@@ -244,8 +244,10 @@ def _reference_cells(shapes: tuple[EffectorShape, ...], rotations: int, device: 
 
 
 def _footprint_margins(cell: CellSpec, quarter_turned: int) -> tuple[int, int, int, int]:
-    """Return margins after which window ``(i, j)`` of a map over place cells belongs to offset ``O - 1 - (i, j)``.
+    """Return the margins to add to a map over place cells before it is cut into windows.
 
+    Window ``(i, j)`` then has, for each footprint, the value at the place cell from which offset ``O - 1 - (i, j)``
+    reaches it.
     The footprint at f is reached with offset o if the reference cell is at f + ref - o.
     """
     _, _, ref_x, ref_y, _ = cell.effector(quarter_turned)
@@ -277,7 +279,10 @@ def _least_clearance(cell: CellSpec, maps: PlacingMaps, quarter_turned: int, gra
 
 
 def _far_unless(used: Tensor) -> Tensor:
-    """Return FAR without a flag, else NEVER, which is below any clearance; torch.maximum is faster than torch.where."""
+    """Return NEVER where ``used`` is true, else FAR.
+
+    The maximum with it keeps used clearances and makes the others FAR; torch.maximum is faster than torch.where.
+    """
     return torch.where(used, NEVER, FAR).int()
 
 

@@ -85,7 +85,7 @@ class FootprintContact(Contact):
         self.supporting = surface_from(self.z)
 
     def _highest(self, maps: Tensor, axis: int, size: Tensor) -> Tensor:
-        """Return the maximum over a footprint's side along an axis, from each cell on except the last ``side - 1``."""
+        """Return for each cell the maximum over ``size`` cells from there along an axis, without the padding."""
         step, count = torch.arange(self.side, device=size.device), maps.shape[axis] - self.side + 1
         # torch.minimum is far faster than torch.where.
         limits = torch.where(step.view(-1, 1, 1, 1, 1) < size, torch.iinfo(maps.dtype).max, NEVER).to(maps.dtype)

@@ -63,7 +63,11 @@ class CapturedEnv(TransformedEnv):
         return tensordict.set("next", entries["next"]), entries["root"]
 
     def _advance(self, entries: dict[str, Tensor]) -> dict:
-        """Step, reset the problems that are done; return what the step led to, and from where the next one starts."""
+        """Make a step and reset the problems that are done.
+
+        Returns:
+            The result of the step (``next``), and the observation from which the next one starts (``root``).
+        """
         after = self.base_env._step(TensorDict({"action": entries["action"]}, self.batch_size))
         settings = {key: value for key, value in entries.items() if key != "action"}
         start = self.base_env._reset(TensorDict({"_reset": after["done"], **settings}, self.batch_size))

@@ -80,9 +80,8 @@ class Trainer:
         self.cfg, self.run_dir, self.resumed = cfg, run_dir, resume is not None
         self.saved_config, self.resume_overrides = checkpoint_config(cfg)
         self.device = use_machine(cfg)
-        self.compile: CompileSettings = (
-            build("compile", cfg.compile) if cfg.get("compile") else NO_COMPILE
-        )  # older runs have none
+        # Older runs have no such settings.
+        self.compile: CompileSettings = build("compile", cfg.compile) if cfg.get("compile") else NO_COMPILE
         torch.manual_seed(cfg.seed)
         self.state, facts, self.safe_folder = resume or ({}, {}, None)
         self.frames, self.iteration, self.best, self.latest = ({**NEW, **facts}[key] for key in NEW)
@@ -248,13 +247,8 @@ class Trainer:
             elif self.is_complete:
                 log.info("this training is complete; total_frames above %s continues it", self.frames)
             else:
-                log.info(
-                    "%s frames to train, at %s %d of %d",
-                    f"{max(self.cfg.total_frames - self.frames, 0):,}",
-                    self.curriculum.level_name,
-                    self.curriculum.level,
-                    self.curriculum.end,
-                )
+                left, now = max(self.cfg.total_frames - self.frames, 0), self.curriculum
+                log.info("%s frames to train, at %s %d of %d", f"{left:,}", now.level_name, now.level, now.end)
             bar = None if self.cfg.get("quiet") else cleanup.enter_context(terminal_bar())
             self.progress = Progress(self.frames, self.cfg.total_frames, self.cfg.progress_interval, bar)
             cleanup.enter_context(checkpoint_hint(lambda: self.safe_folder, self.resume_overrides))

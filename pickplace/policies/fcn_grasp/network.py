@@ -17,8 +17,8 @@ OUTSIDE = -1000  # the depth of a cell that is not in the tote
 FAR_DOWN = 10_000  # deeper than any tote
 
 #: Pairs ``(beyond, step)``: more than ``beyond`` rows of a bf16 product are rounded up to a multiple of ``step``. A
-#: kernel is prepared and kept for each number of rows, which takes time and memory. Few rows are rounded up, too: their
-#: products add up in another order, so the size of the batch would decide near ties.
+#: kernel is prepared and kept for each number of rows, which takes time and memory. Small numbers of rows are
+#: rounded up, too: else their products are summed in another order, and the size of the batch decides near ties.
 PADDED_ROWS = ((4096, 512), (0, 64))
 
 

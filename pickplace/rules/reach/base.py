@@ -84,6 +84,6 @@ class Limits(Reach):
 
 
 def whole_heights(cell: Any, lowest: Tensor, highest: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the whole height units inside ranges in sides of a cell, as ranges, int32, from 0 to above any height."""
+    """Convert ranges of heights from sides of a cell to whole height units, int32, rounded inwards."""
     low, high = lowest / cell.height_unit - ROUNDING, highest / cell.height_unit + ROUNDING
     return low.clamp(0, FAR).ceil().int(), high.clamp(NEVER, FAR).floor().int()

@@ -51,7 +51,8 @@ class Contact:
     def ends(self) -> Iterator[Tensor]:
         """Yield for each row of the square along y how far its supporting cells reach, int32 ``[2, *shape of z]``.
 
-        The last of them is counted from the footprint's near side, then the first from its far side; 0: there is none.
+        The first number counts the cells from the near side (y = 0) to the last supporting cell, the second one those
+        from the far side to the first. Both are 0 in a row without any.
         """
         rows = ((self.surfaces == self.supporting) & self.under).unflatten(0, (self.side, self.side))
         step = torch.arange(self.side, dtype=torch.int32, device=rows.device)[:, None]
@@ -145,10 +146,10 @@ class Contact:
         return (left + right >= 0).all(0)
 
     def is_centre_on_near_edge(self) -> Tensor:
-        """Return whether no supporting cell's middle has less y than the item's centre, and not all are on a line.
+        """Return whether the centre lies on the hull's edge of least y: no supporting cell's middle has a smaller y.
 
-        Valid only for a centre in the hull of the middles or on its edge. If all middles are on a line, it passes
-        through the centre, so that they lie in one direction from there, or in the opposite one.
+        It is false if all middles are on one line. Valid only for a centre in the hull of the middles or on its edge:
+        then such a line passes through the centre, and they lie in one direction from there, or in the opposite one.
         """
         exact = exact_dtype(self.side)
         w, d, nan = self.w.short(), self.d.short(), torch.nan

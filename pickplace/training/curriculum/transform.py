@@ -66,7 +66,7 @@ class ToteHeightCurriculum(Transform):
 
 
 def _relative(weights: Sequence[float]) -> Tensor:
-    """Return weights as shares of the greatest one: torch draws by no sum that is infinite."""
+    """Return the weights divided by the greatest one: torch cannot draw by weights whose sum is infinite."""
     shares = torch.tensor([*weights], dtype=torch.float64)
     return (shares / shares.max()).float() if len(shares) else shares
 
