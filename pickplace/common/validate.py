@@ -161,12 +161,6 @@ def odd_number(key: str, value, least: int = 1, most: int = 99) -> int:
     return int(expect(good, key, value, f"an odd number >= {least} and <= {most}"))
 
 
-def number_or_null(key: str, value, least: float, most: float) -> float | None:
-    """Return ``value`` if it is None or a finite number in ``[least, most]``."""
-    good = value is None or (is_number(value) and least <= value <= most)
-    return expect(good, key, value, f"a number between {least:g} and {most:g}, or null")
-
-
 def or_null(check: Callable[..., Any], key: str, value, *limits) -> Any:
     """Return None for None, and the result of a validator for any other value."""
     return None if value is None else check(key, value, *limits)

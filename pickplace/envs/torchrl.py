@@ -180,7 +180,7 @@ class PickPlaceEnv(EnvBase):
             "episode": zeros(),
             "item_seed": torch.tensor(0, device=self.device),
             "feasible": zeros(dtype=torch.bool),
-            **({} if (pile := self._empty_pile(num_envs)) is None else pile._asdict()),
+            **(Pile.empty(num_envs, cell.tote_size, cell.pile_room, self.device)._asdict() if cell.handling else {}),
             **{RESET_ENTRIES[key].field: zeros() + RESET_ENTRIES[key].full(cell) for key in self.limits},
             **{name: zeros(size, dtype=torch.bool) for name, size in sizes.items()},
         }
@@ -307,9 +307,6 @@ class PickPlaceEnv(EnvBase):
         """The state of all problems."""
         items, coming = Item.from_table(self.item), Item.from_table(self.coming) if self.cell.preview else None
         return State(self.surface, self.tote_height, items, self._episode_settings, self._pile, coming)
-
-    def _empty_pile(self, batch: int) -> Pile | None:
-        return Pile.empty(batch, self.cell.tote_size, self.cell.pile_room, self.device) if self.cell.handling else None
 
     @property
     def _pile(self) -> Pile | None:

@@ -210,30 +210,21 @@ def play(
 
 @torch.no_grad()
 def decision_latency(make_env: MakeEnv, planner: BatchPlanner, decisions: int) -> dict[str, float] | None:
-    """Return the milliseconds of a decision for one tote, ``{"p50", "p95", "cpu_p50", "cpu_mean"}``; None without any.
-
-    The states are those of episodes. The last two figures are CPU time of all threads together, which depends little
-    on other load of the machine. A search may take long in a few states, so its mean can be far above its median.
-    """
+    """Return the milliseconds of a decision for one tote in states of episodes, ``{"p50", "p95"}``; None without any."""
     if decisions < 1:
         return None
     env = make_env(0, 1)
     observation, times = env.reset(), []
     decide(planner, env.cell, observation)  # warm up
     for _ in range(decisions):
-        start, cpu_start = time.perf_counter(), time.process_time()
+        start = time.perf_counter()
         action = decide(planner, env.cell, observation)
         if action.device.type == "cuda":  # where a call returns before its work is done
             torch.cuda.synchronize(action.device)
-        times.append(((time.perf_counter() - start) * 1e3, (time.process_time() - cpu_start) * 1e3))
+        times.append((time.perf_counter() - start) * 1e3)
         _, observation = env.step_and_maybe_reset(observation.set("action", action))
-    wall, cpu = torch.tensor(times, dtype=torch.float64).T
-    return {
-        "p50": float(wall.quantile(0.5)),
-        "p95": float(wall.quantile(0.95)),
-        "cpu_p50": float(cpu.quantile(0.5)),
-        "cpu_mean": float(cpu.mean()),
-    }
+    milliseconds = torch.tensor(times, dtype=torch.float64)
+    return {"p50": float(milliseconds.quantile(0.5)), "p95": float(milliseconds.quantile(0.95))}
 
 
 def carry_out(engine: Engine, plans: Sequence[EpisodePlan], recordings: Sequence[Recording]) -> list[Outcome]:

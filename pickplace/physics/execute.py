@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from pickplace.common.validate import number_or_null, refuse_if
+from pickplace.common.validate import number, or_null, refuse_if
 from pickplace.physics.plans import TOLERANCE, EpisodePlan, Placement, Point
 from pickplace.physics.scene import STIFF, TIMESTEP, WALL, Scene, mujoco
 from pickplace.physics.simulation import Loss, Simulation, wait
@@ -72,7 +72,7 @@ class Execute(Simulation):
 
     def __post_init__(self):
         super().__post_init__()
-        number_or_null("physics.plate_diameter", self.plate_diameter, 1e-3, 10)
+        or_null(number, "physics.plate_diameter", self.plate_diameter, 1e-3, 10)
 
     def make_scene(self, plan: EpisodePlan) -> "Gantry":
         refuse_if(

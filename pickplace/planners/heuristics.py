@@ -97,7 +97,8 @@ class _Cheapest(MapPlanner):
     index. So it does not matter how an item lies in the bin.
     """
 
-    item: str
+    def __init__(self, cell: CellSpec, item: str = "any"):
+        self.cell, self.item = cell, one_of("planner.item", item, ITEM_RULES)
 
     @abstractmethod
     def cost(self, cell: CellSpec, state: State, maps: PlacingMaps, distance: Tensor) -> Tensor:
@@ -131,9 +132,6 @@ class JointDBL(_Cheapest):
 
     name = "joint_dbl"
 
-    def __init__(self, cell: CellSpec, item: str = "any"):
-        self.cell, self.item = cell, one_of("planner.item", item, ITEM_RULES)
-
     def cost(self, cell: CellSpec, state: State, maps: PlacingMaps, distance: Tensor) -> Tensor:
         return dbl_order(cell, maps.top).double()
 
@@ -152,7 +150,7 @@ class Corner(_Cheapest):
     name = "corner"
 
     def __init__(self, cell: CellSpec, height_weight: float = 10, item: str = "any"):
-        self.cell, self.item = cell, one_of("planner.item", item, ITEM_RULES)
+        super().__init__(cell, item)
         self.height_weight = number("planner.height_weight", height_weight)
 
     def cost(self, cell: CellSpec, state: State, maps: PlacingMaps, distance: Tensor) -> Tensor:
@@ -174,7 +172,7 @@ class HeightmapMinimisation(_Cheapest):
     name = "heightmap_minimisation"
 
     def __init__(self, cell: CellSpec, distance_weight: float = 0.01, item: str = "any"):
-        self.cell, self.item = cell, one_of("planner.item", item, ITEM_RULES)
+        super().__init__(cell, item)
         self.distance_weight = number("planner.distance_weight", distance_weight)
 
     def cost(self, cell: CellSpec, state: State, maps: PlacingMaps, distance: Tensor) -> Tensor:

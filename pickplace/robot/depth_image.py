@@ -7,7 +7,7 @@ gap is a *hole*, and may hide anything.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -156,17 +156,7 @@ def read_heights(
     single = level & _is_short(gaps)
     height = np.where(single, smooth, height)
     highest, lowest = (np.where(gaps & ~single, bound, height) for bound in (high, low))
-    return Heights(
-        origin,
-        rays,
-        (rows.start, columns.start),
-        pixel,
-        raw,
-        height,
-        highest,
-        np.where(is_recorded, 0.0, lowest),
-        holes,
-    )
+    return replace(seen, height=height, highest=highest, lowest=np.where(is_recorded, 0.0, lowest))
 
 
 def level_range(accuracy: float) -> float:

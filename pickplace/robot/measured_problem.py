@@ -364,8 +364,7 @@ def _limits(cell: CellSpec, free: CellSpec, bin_clear: Tensor, centres: np.ndarr
     """
     device, limits = bin_clear.device, free.limits
     if limits is None:
-        places = torch.zeros(cell.rotations, *cell.tote_size[:2], dtype=torch.int64, device=device)
-        return Limits(bin_clear, places, places + FAR)
+        return Limits.of_picks(cell, bin_clear)
     # Millimetres per height unit of the limits: a table has the height units of the cell.
     ratio = cell.height_unit / free.height_unit if isinstance(cell.reach, Limits) else 1.0
     return Limits(

@@ -189,8 +189,7 @@ def without_excluded(cell: CellSpec, exclude: Sequence[Sequence[float]]) -> Cell
     if not (excluded := torch.from_numpy(is_excluded(exclude, centres, 1.0))).any():
         return cell
     if limits is None:
-        places = torch.zeros(cell.rotations, *cell.tote_size[:2], dtype=torch.int64)
-        return replace(cell, reach=Limits(~excluded, places, places + FAR))
+        return replace(cell, reach=Limits.of_picks(cell, ~excluded))
     return replace(cell, reach=replace(limits, pick_ok=limits.pick_ok & ~excluded.to(limits.pick_ok.device)))
 
 

@@ -64,7 +64,7 @@ class EpisodeSettings(NamedTuple):
     @classmethod
     def from_observation(cls, observation: Observation) -> "EpisodeSettings":
         """Return the settings in the entries of an observation."""
-        read = {key: observation.get(key, None) for key in ("item_mix", "bin_items", "refill", "preview", "level")}
+        read = {key: observation.get(key, None) for key in cls._fields if key != "turns"}
         rotations = observation.get("rotations", None)
         return cls(
             turns=rotations if rotations is None else turns_from_flags(rotations),

@@ -170,7 +170,7 @@ def test_evaluation_json(command, evaluation, group, stream, seed):
     assert sum(result["failures"].values()) == 5 and occupancy["min"] == min(occupancy["per_episode"])
     assert occupancy["mean"] == pytest.approx(sum(occupancy["per_episode"]) / 5)
     assert occupancy["ci95"][0] <= occupancy["mean"] <= occupancy["ci95"][1]
-    assert 0 < latency["p50"] <= latency["p95"] and 0 < latency["cpu_p50"] < 60_000 and 0 < latency["cpu_mean"] < 60_000
+    assert 0 < latency["p50"] <= latency["p95"] < 60_000
     assert set(result["versions"]) >= {"pickplace", "torch", "torchrl", "tensordict", "python"}
     assert {path.name for path in result["path"].parent.iterdir()} >= {"tote.png", "evaluation.md"}
     assert "occupancy" in result["out"]

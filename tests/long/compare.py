@@ -3,9 +3,8 @@
 python tests/long/compare.py <older checkout> [--match REGEX] [--episodes 100] [--folder outputs/compare] [--list]
 
 Each case runs in both checkouts with one thread. Trainings must leave the same metrics, except times, and the same
-tensors; evaluations the same episodes; robot plans the same fields. :data:`RENAMED_WORDS`, :data:`RENAMED_TENSORS` and
-:data:`CHANGED_TENSORS` are the map from the older form to today's. What the older checkout wrote is kept in the folder
-and used again.
+tensors; evaluations the same episodes; robot plans the same fields. What the older checkout wrote is kept in the
+folder and used again.
 """
 
 import argparse
@@ -16,7 +15,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,17 +24,6 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 ROOT = Path(__file__).resolve().parents[2]
-
-#: Words of a command line: pattern of the older form, and today's form.
-RENAMED_WORDS: dict[str, str] = {}
-#: Names of tensors in a checkpoint: pattern of the older form, and today's form.
-RENAMED_TENSORS: dict[str, str] = {r"^optimizer\|": "algorithm|optimizer|"}
-#: Tensors whose form changed: pattern of today's name, and a function that brings a tensor into the older form.
-CHANGED_TENSORS: dict[str, Callable[[Tensor], Tensor]] = {
-    r"collector\|(worker\d+\|)?environment\|item": lambda item: item[:, 0, :5],  # [N, M, columns] was [N, 5]
-}
-#: Tensors that the older checkout did not have: patterns of today's names.
-NEW_TENSORS = (r"collector\|(worker\d+\|)?environment\|arrived", r"policy\|network\.rest_of_bin")
 
 TRAINING = ["threads=1", "evaluation.episodes=16", "evaluation.batch_size=16"]
 #: A few batches each, through all phases, with a validation and a checkpoint within.
@@ -76,26 +64,18 @@ ROBOT_SCENES = 30  # of each of the 16 planners and grippers: 480 plans
 
 
 class Case(NamedTuple):
-    """One comparison: a name, the command, and its words in the older and in today's form."""
+    """One comparison."""
 
     name: str
     command: str  # "train", "evaluate" or "robot"
-    old: list[str]
-    new: list[str]
+    words: list[str]
 
 
-def renamed(words: list[str]) -> list[str]:
-    """Return the words of a command line in today's form."""
-    for pattern, form in RENAMED_WORDS.items():
-        words = [re.sub(pattern, form, word) for word in words]
-    return words
-
-
-def benchmark_words(checkout: Path) -> dict[str, list[str]]:
-    """Return the command line of each row of the packing benchmarks that a checkout has published."""
+def benchmark_words() -> dict[str, list[str]]:
+    """Return the command line of each published row of the packing benchmarks."""
     code = "import json, packing; rows = {r.name: r.words() for r in packing.rows()}"
     code += "; print(json.dumps({name: rows[name] for name in packing.read() if name in rows}))"
-    out = subprocess.run([sys.executable, "-c", code], cwd=checkout / "benchmarks", env=environment(checkout),
+    out = subprocess.run([sys.executable, "-c", code], cwd=ROOT / "benchmarks", env=environment(ROOT),
                          check=True, capture_output=True, text=True)  # fmt: skip
     left_out = ("physics=", "evaluation.", "threads=")
     return {
@@ -108,11 +88,11 @@ def cases(old: Path, episodes: int) -> Iterator[Case]:
     """Yield all cases: trainings, searches and heuristics, cards, rows of benchmarks, and robot plans."""
     for name, line in TRAININGS.items():
         words = [*TRAINING, *line.split()]
-        yield Case(f"train-{name}", "train", words, renamed(words))
+        yield Case(f"train-{name}", "train", words)
     common = ["threads=1", "evaluation.latency_decisions=0", "evaluation.replay=0"]
     for name, line in EVALUATIONS.items():
         words = [*common, "evaluation.episodes=20", *line.split()]
-        yield Case(f"planner-{name}", "evaluate", words, renamed(words))
+        yield Case(f"planner-{name}", "evaluate", words)
     for path in sorted((old / "pickplace" / "pretrained").glob("*/card.json")):
         card = json.loads(path.read_text())
         for claimed in card["evaluations"]:
@@ -122,12 +102,10 @@ def cases(old: Path, episodes: int) -> Iterator[Case]:
             words += [f"evaluation.{key}={claimed[key]}" for key in ("seed", "stream")]
             words += [f"planner.candidates={claimed['candidates']}"]
             size = "x".join(map(str, claimed["env"]["tote_size"]))
-            yield Case(f"card-{path.parent.name}-{size}-K{claimed['candidates']}", "evaluate", words, renamed(words))
-    ours = benchmark_words(ROOT)
-    for name, words in benchmark_words(old).items():
-        common_words = [*common, f"evaluation.episodes={episodes}"]
-        yield Case(f"benchmark-{name}", "evaluate", [*words, *common_words], [*ours[name], *common_words])
-    yield Case("robot-plans", "robot", [], [])
+            yield Case(f"card-{path.parent.name}-{size}-K{claimed['candidates']}", "evaluate", words)
+    for name, words in benchmark_words().items():
+        yield Case(f"benchmark-{name}", "evaluate", [*words, *common, f"evaluation.episodes={episodes}"])
+    yield Case("robot-plans", "robot", [])
 
 
 def environment(checkout: Path) -> dict[str, str]:
@@ -135,10 +113,10 @@ def environment(checkout: Path) -> dict[str, str]:
     return os.environ | {"PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
 
 
-def play(case: Case, checkout: Path, words: list[str], folder: Path) -> None:
+def play(case: Case, checkout: Path, folder: Path) -> None:
     """Run a case in a checkout, unless the folder has what an equal command wrote."""
     stamp = folder / "words.json"
-    if checkout != ROOT and stamp.is_file() and json.loads(stamp.read_text()) == words:
+    if checkout != ROOT and stamp.is_file() and json.loads(stamp.read_text()) == case.words:
         return
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -151,38 +129,22 @@ def play(case: Case, checkout: Path, words: list[str], folder: Path) -> None:
         ]
     else:
         start = f"from pickplace.cli import {case.command}; {case.command}()"
-        command = [sys.executable, "-c", start, *words, f"hydra.run.dir={folder}/run"]
+        command = [sys.executable, "-c", start, *case.words, f"hydra.run.dir={folder}/run"]
     with (folder / "log").open("w") as log:
         done = subprocess.run(command, cwd=checkout, env=environment(checkout), stdout=log, stderr=subprocess.STDOUT)
     if done.returncode:
         raise RuntimeError(f"exit code {done.returncode}, see {folder / 'log'}")
-    stamp.write_text(json.dumps(words))
+    stamp.write_text(json.dumps(case.words))
 
 
 def tensor_differences(old: dict[str, Tensor], new: dict[str, Tensor]) -> list[str]:
     """Return a line for each tensor of two checkpoints that differs or has no counterpart."""
-    found, left = [], by_rank(new)
-    for name, tensor in by_rank(old).items():
-        today = name
-        for pattern, form in RENAMED_TENSORS.items():
-            today = re.sub(pattern, form, today)
-        if today not in left:
-            found.append(f"{name}: there is no {today}")
-            continue
-        other = left.pop(today)
-        for pattern, change in CHANGED_TENSORS.items():
-            other = change(other) if re.fullmatch(pattern, today) else other
-        if tensor.shape != other.shape or tensor.dtype != other.dtype or not torch.equal(tensor, other):
+    found = [f"{name}: only in one checkpoint" for name in sorted(old.keys() ^ new.keys())]
+    for name in old.keys() & new.keys():
+        one, other = old[name], new[name]
+        if one.shape != other.shape or one.dtype != other.dtype or not torch.equal(one, other):
             found.append(f"{name}: differs")
-    return found + [f"{name}: new" for name in left if not any(re.fullmatch(each, name) for each in NEW_TENSORS)]
-
-
-def by_rank(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Return tensors with the parameters of the optimizer counted without those that had no gradient."""
-    pattern = re.compile(r"optimizer\|(\d+)\|")
-    numbers = sorted({int(found[1]) for name in tensors if (found := pattern.search(name))})
-    rank = {str(number): f"optimizer|{rank}|" for rank, number in enumerate(numbers)}
-    return {pattern.sub(lambda found: rank[found[1]], name): tensor for name, tensor in tensors.items()}
+    return found
 
 
 def metric_differences(old: Path, new: Path) -> list[str]:
@@ -244,11 +206,11 @@ def main() -> None:
         if not re.search(given.match, case.name) or re.search(given.skip, case.name):
             continue
         if given.list:
-            sys.stdout.write(" ".join([case.name, *case.new]) + "\n")
+            sys.stdout.write(" ".join([case.name, *case.words]) + "\n")
             continue
         try:
-            for name, checkout, words in (("old", old, case.old), ("new", ROOT, case.new)):
-                play(case, checkout, words, folder / name / case.name)
+            for name, checkout in (("old", old), ("new", ROOT)):
+                play(case, checkout, folder / name / case.name)
             found = differences(case, folder / "old" / case.name, folder / "new" / case.name)
         except (RuntimeError, OSError, ValueError) as error:
             found = [str(error)]

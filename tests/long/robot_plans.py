@@ -4,8 +4,7 @@ python tests/long/robot_plans.py <scenes of each of 16 planners> <plans.jsonl>
 
 Each line is a plan with every field, or the key that an error names. The scenes are random: boxes in bin and tote,
 measured as boxes, as maps in metres, as maps of whole cells, or by cameras; several planners, policies, grippers and
-reaches. Run it with ``PYTHONPATH`` set to each version, then compare the files with ``diff``. :func:`plan` and
-:func:`annulus` alone know how the versions differ.
+reaches. Run it with ``PYTHONPATH`` set to each version, then compare the files with ``diff``.
 """
 
 import json
@@ -19,12 +18,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "robot"))
 
 import scenes  # noqa: E402
 
-from pickplace import Box, Camera, CellSpec, Planner  # noqa: E402
-
-try:
-    from pickplace import Scene
-except ImportError:  # the version before scenes
-    Scene = None
+from pickplace import Box, Camera, CellSpec, Planner, Scene  # noqa: E402
+from pickplace.rules.reach.annulus import Annulus  # noqa: E402
 
 TOTE, ACCURACY = (0.3, 0.3, 0.25), 0.002
 IMAGE = (120, 160)
@@ -58,23 +53,8 @@ CELLS = [
 ]
 
 
-def marks_bearing(cell) -> bool:
-    """Return whether plans say where the tote bears weight; in older versions the rule is a name."""
-    return getattr(cell.support, "marks_bearing", cell.support == "bearing")
-
-
-def annulus(*args):
-    """Return a reach."""
-    from importlib import import_module
-
-    module = "pickplace.task.reach" if Scene is None else "pickplace.rules.reach.annulus"
-    return import_module(module).Annulus(*args)
-
-
 def plan(planner, alternatives: int, **seen):
     """Return the plan for what is seen, in the keys of a line of ``pickplace-plan``, or for the map of a camera."""
-    if Scene is None:
-        return planner.plan(alternatives=alternatives, **seen)
     tote = seen.pop("tote") if "tote" in seen else seen.pop("tote_depth")
     if "items" in seen:
         return planner.plan(Scene(seen.pop("items"), tote, **seen), alternatives=alternatives)
@@ -84,7 +64,7 @@ def plan(planner, alternatives: int, **seen):
 def make_planner(name: str, options: dict, sizes: dict):
     """Return a planner of a name, or of a checkpoint."""
     if "reach" in sizes:
-        sizes = sizes | {"reach": annulus(*sizes["reach"])}
+        sizes = sizes | {"reach": Annulus(*sizes["reach"])}
     if "/" in name:
         return Planner.load(name, **options, **sizes)
     return Planner(CellSpec(**sizes), planner=name)
@@ -148,7 +128,7 @@ def as_cells(draw: np.random.Generator, world: scenes.World, cell, side: float) 
             depth[x : x + w, y : y + d], labels[x : x + w, y : y + d] = draw.integers(1, 4), label
     rim = cell.tote_size[2]
     heights = np.minimum(np.round(tote_heights(world, cell, side, 1) / (side * cell.height_unit)), rim).astype(int)
-    bearing = draw.integers(0, 2, heights.shape) if marks_bearing(cell) and draw.random() < 0.5 else None
+    bearing = draw.integers(0, 2, heights.shape) if cell.support.marks_bearing and draw.random() < 0.5 else None
     seen = {"bin_depth": depth, "tote_depth": rim - heights, "tote_bearing": bearing}
     return seen | ({"bin_labels": labels} if world.others else {})
 
@@ -190,7 +170,7 @@ def tote_heights(world: scenes.World, cell, side: float, along: int) -> np.ndarr
 def metres(draw: np.random.Generator, world: scenes.World, cell, side: float) -> dict:
     """Return the settings of a scene in metres."""
     shape = cell.tote_size[:2]
-    bearing = draw.integers(0, 4, shape) > 0 if marks_bearing(cell) and draw.random() < 0.5 else None
+    bearing = draw.integers(0, 4, shape) > 0 if cell.support.marks_bearing and draw.random() < 0.5 else None
     return {
         "cell_size": side, "tote_height": float(world.tote[2]), "accuracy": ACCURACY,
         "clearance": float(draw.choice((0.0, 0.003, 0.005))), "tote_bearing": None if bearing is None else bearing * 1,

@@ -5,6 +5,8 @@ from math import cos, radians, sin
 
 import numpy as np
 
+from pickplace import Scene
+
 EPSILON = 1e-6  # m
 
 
@@ -13,8 +15,6 @@ def plan_for(
     bin_labels=None, alternatives: int = 10, **settings,
 ):  # fmt: skip
     """The plan for boxes, or for maps."""
-    from pickplace import Scene  # here: tests/long/robot_plans.py uses this module with versions that have none
-
     settings |= {"tote_height": tote_height, "cell_size": cell_size}
     if items is not None:
         return planner.plan(Scene(items, tote_depth, **settings), alternatives=alternatives)

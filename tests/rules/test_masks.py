@@ -1,6 +1,5 @@
 """Masks, the single step and the plain-Python oracle agree on random cells, with and without limits on the robot."""
 
-import itertools
 import math
 from dataclasses import replace
 from random import Random
@@ -35,7 +34,6 @@ from pickplace.rules.placing import resting_top
 from pickplace.rules.reach.base import Limits
 from pickplace.rules.state import EMPTY, surface_from
 from pickplace.rules.step import apply, put_down
-from pickplace.rules.support.contact import Contact
 from pickplace.rules.support.rules import Hull
 
 
@@ -276,23 +274,6 @@ def test_the_hull_rule_equals_scipys_hull(data):
     assume(abs(outside + margin) > 1e-9 or margin == 0)
     expected = SUCCESS if outside < -margin - 1e-9 else UNSTABLE
     assert rest_on(heights, (w, d, 1), Hull(margin)) == expected
-
-
-@settings(max_examples=200)
-@given(st.data())
-def test_an_item_bears_weight_inside_scipys_hull(data):
-    w, d = data.draw(st.integers(1, 16)), data.draw(st.integers(1, 16))
-    held = data.draw(
-        st.lists(st.tuples(st.integers(0, w - 1), st.integers(0, d - 1)), min_size=1, max_size=12, unique=True)
-    )
-    square = list(itertools.product(range(max(w, d)), repeat=2))
-    cells = surface_from(torch.tensor([[int(corner in held)] for corner in square]))
-    under = torch.tensor([[x < w and y < d] for x, y in square])
-    hull = ConvexHull([(x + a, y + b) for x, y in held for a in (0, 1) for b in (0, 1)]).equations
-    corners = np.array([[(x + a, y + b, 1) for a in (0, 1) for b in (0, 1)] for x, y in square])
-    expected = under[:, 0].numpy() & ((corners @ hull.T).max((1, 2)) < 1e-9)
-    contact = Contact(cells, under, torch.ones(1, dtype=torch.int32), torch.tensor([w]), torch.tensor([d]))
-    assert contact.hull_mask()[:, 0].tolist() == expected.tolist()
 
 
 @pytest.mark.parametrize(("support", "third"), [("hull", SUCCESS), ("bearing", UNSTABLE)])

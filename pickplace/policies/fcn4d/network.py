@@ -26,7 +26,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pickplace.common.validate import MAX_WIDTH, number_or_null, one_of, whole_number
+from pickplace.common.validate import MAX_WIDTH, number, one_of, or_null, whole_number
 from pickplace.policies.depth import clip_depth
 from pickplace.policies.dtypes import DTYPES, has_matrix_unit, matrix_dtype
 from pickplace.policies.fcn4d.winograd import SumConvolution, tile_count
@@ -41,9 +41,9 @@ PADDED_PAIRS = 64  # the number of pairs is rounded up to a multiple; see PADDED
 
 def check_clips(place: str, bin_clip: float | None, tote_clip: float | None, floor: float | None) -> None:
     """Refuse limits of depth clipping that are no depths; ``place`` is their place in the config."""
-    number_or_null(f"{place}.bin_clip", bin_clip, 0, MAX_DEPTH)
-    number_or_null(f"{place}.tote_clip", tote_clip, 0, MAX_DEPTH)
-    number_or_null(f"{place}.floor", floor, -MAX_DEPTH, MAX_DEPTH)
+    or_null(number, f"{place}.bin_clip", bin_clip, 0, MAX_DEPTH)
+    or_null(number, f"{place}.tote_clip", tote_clip, 0, MAX_DEPTH)
+    or_null(number, f"{place}.floor", floor, -MAX_DEPTH, MAX_DEPTH)
 
 
 def clip_and_pad(depth: Tensor, limit: float | None, floor: float | None, padding: float) -> Tensor:
@@ -107,7 +107,7 @@ class Conv4dNet(nn.Module):
         whole_number("model.actor.filters", filters, most=MAX_WIDTH)
         one_of("model.actor.compute_dtype", compute_dtype, DTYPES)
         check_clips("model.actor", bin_clip, tote_clip, floor)
-        number_or_null("model.actor.head_std", head_std, 0, 1e3)
+        or_null(number, "model.actor.head_std", head_std, 0, 1e3)
         whole_number("model.actor.chunk_bytes", chunk_bytes, most=2**30)
         self.rotations, self.filters = rotations, filters
         self.bin_clip, self.tote_clip, self.floor = bin_clip, tote_clip, floor

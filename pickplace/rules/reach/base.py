@@ -55,6 +55,12 @@ class Limits(Reach):
     lowest_pick: Tensor | None = None
     highest_pick: Tensor | None = None
 
+    @classmethod
+    def of_picks(cls, cell: Any, pick_ok: Tensor) -> "Limits":
+        """Return the limits that forbid some picks, and nothing else."""
+        places = torch.zeros(cell.rotations, *cell.tote_size[:2], dtype=torch.int64, device=pick_ok.device)
+        return cls(pick_ok, places, places + FAR)
+
     def limits(self, cell: Any) -> "Limits":
         return self
 
