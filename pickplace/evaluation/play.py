@@ -210,7 +210,7 @@ def play(
 
 @torch.no_grad()
 def decision_latency(make_env: MakeEnv, planner: BatchPlanner, decisions: int) -> dict[str, float] | None:
-    """Return the milliseconds of a decision for one tote in states of episodes, ``{"p50", "p95"}``; None without any."""
+    """Return the milliseconds of a decision for one tote in states of episodes, ``{"p50", "p95"}``; None for 0."""
     if decisions < 1:
         return None
     env = make_env(0, 1)
