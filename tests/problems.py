@@ -1,7 +1,7 @@
 """Random problems, in the forms of the package and of the plain-Python oracle; shared by tests of several packages."""
 
 from dataclasses import replace
-from itertools import product
+from itertools import combinations, product
 from random import Random
 from typing import NamedTuple
 
@@ -222,3 +222,18 @@ def occupancies(planner, env: PickPlaceEnv) -> torch.Tensor:
         running = running[~after["done"][running, 0]]
         observation = step_mdp(observation)
     return reached
+
+
+def spaces_by_hand(heights):
+    """Return the floor and the sides ``(x0, y0, x1, y1)`` of each maximal empty space above heights ``[W][D]``."""
+    wide, deep = len(heights), len(heights[0])
+
+    def highest(x0, y0, x1, y1):
+        cells = product(range(x0, x1), range(y0, y1))
+        return max(heights[x][y] if 0 <= x < wide and 0 <= y < deep else 10**6 for x, y in cells)
+
+    for (x0, x1), (y0, y1) in product(combinations(range(wide + 1), 2), combinations(range(deep + 1), 2)):
+        floor = highest(x0, y0, x1, y1)
+        grown = (x0 - 1, y0, x1, y1), (x0, y0 - 1, x1, y1), (x0, y0, x1 + 1, y1), (x0, y0, x1, y1 + 1)
+        if all(highest(*box) > floor for box in grown):
+            yield floor, x0, y0, x1, y1

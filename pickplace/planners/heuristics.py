@@ -1,14 +1,15 @@
 """Planners that need no training."""
 
 from abc import abstractmethod
+from itertools import product
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from pickplace.common.validate import number, one_of
 from pickplace.items.distributions import check_seed
 from pickplace.planners.base import ITEM_RULES, MapPlanner, first_choice, narrow_first, pick_first, restrict_items
+from pickplace.planners.empty_spaces import empty_spaces
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import PICKS, all_grasps, join_pick
 from pickplace.rules.item import Observation
@@ -184,12 +185,12 @@ class HeightmapMinimisation(_Cheapest):
 
 
 class IndividualHeuristic(MapPlanner):
-    """Picks without a look at the tote, then places deepest-bottom-left in the corners of the tote's free rectangles.
+    """Picks without a look at the tote, then places deepest-bottom-left in the corners of empty spaces.
 
-    Free cells are those that are not higher than the level on which the item would rest. A candidate is a footprint in
-    a corner of a maximal rectangle of free cells (MaxRects, Jylanki 2010). The candidates are tried in a forward
-    simulation, in the order (top, footprint y, footprint x), and the first that succeeds is played. Ties go to the
-    item's narrower side along x, then to the lowest flat index. If none succeeds, the first is played, and fails.
+    A candidate is a footprint in a corner of a maximal empty space, on its floor (MaxRects, Jylanki 2010). The
+    candidates are tried in a forward simulation, in the order (top, footprint y, footprint x), and the first that
+    succeeds is played. Ties go to the item's narrower side along x, then to the lowest flat index. If none succeeds,
+    the first is played, and fails.
 
     Of several items in the bin it takes the first that can be picked.
 
@@ -226,52 +227,19 @@ class IndividualHeuristic(MapPlanner):
 
 
 def corner_footprints(cell: CellSpec, heights: Tensor, maps: PlacingMaps) -> Tensor:
-    """Mask of the footprints in a corner of a maximal free rectangle of their level, bool ``[N, Q, W_T, D_T]``.
-
-    The free cells of a level are those that are not higher. A footprint's level is the height on which it rests.
+    """Mask of the footprints in a corner of a maximal empty space on whose floor they rest, bool ``[N, Q, W_T, D_T]``.
 
     Args:
         heights: int32 ``[N, W_T, D_T]``.
         maps: of this state; footprints on which the item cannot rest are in no corner.
     """
-    top, item = maps.top, maps.item
-    found = torch.zeros_like(top, dtype=torch.bool)
-    level = top - item.h[:, None, None, None]
-    sides = item.w[:, None, None], item.d[:, None, None]
-    for z in level[top >= 0].unique().tolist():
-        free = heights <= z
-        for quarter_turned, (w, d) in enumerate((sides, sides[::-1])[: cell.footprint_turns]):
-            on_level = (level[:, quarter_turned] == z) & (top[:, quarter_turned] >= 0)
-            for axes in ((), (1,), (2,), (1, 2)):
-                # The corner at which both coordinates are least, after flipping the tote.
-                corner = _least_corners(free.flip(axes), w, d).flip(axes)
-                for axis in axes:  # from the footprint's last cell to its first
-                    corner = _shift(corner, axis, (w, d)[axis - 1] - 1)
-                found[:, quarter_turned] |= corner & on_level
+    found, spaces = torch.zeros_like(maps.top, dtype=torch.bool), empty_spaces(heights)
+    level = maps.top - maps.item.h[:, None, None, None]
+    for turned in range(cell.footprint_turns):
+        w, d = (side[spaces.row] for side in (maps.item.w, maps.item.d)[:: 1 - 2 * turned])
+        fits = (spaces.x1 - spaces.x0 >= w) & (spaces.y1 - spaces.y0 >= d)
+        row, floor, x0, y0, x1, y1 = (part[fits] for part in spaces)
+        for x, y in product((x0, x1 - w[fits]), (y0, y1 - d[fits])):
+            rests = level[row, turned, x, y] == floor
+            found[row[rests], turned, x[rests], y[rests]] = True
     return found
-
-
-def _least_corners(free: Tensor, w: Tensor, d: Tensor) -> Tensor:
-    """Return the cells at which a maximal rectangle of free cells, at least ``w x d``, begins, bool ``[N, W, D]``."""
-    tote_w, tote_d = free.shape[1:]
-    x = torch.arange(tote_w, device=free.device)[:, None]
-    # Number of free cells from each cell on along x; the same in the row before; whether the cell before is not free.
-    run = torch.where(free, tote_w, x).flip(1).cummin(1).values.flip(1) - x
-    before = F.pad(run[:, :, :-1], (1, 0))
-    blocked_left = F.pad(~free[:, :-1], (0, 0, 1, 0), value=True)
-    # For each depth, the widest rectangle that begins at a cell; it is maximal if no side can move outwards.
-    corner, width, closed = torch.zeros_like(free), run, blocked_left
-    for depth in range(1, tote_d + 1):
-        longer = torch.minimum(width, F.pad(run[:, :, depth:], (0, depth)))  # the width with one row more
-        fits = (width >= w) & (d <= depth)
-        corner |= fits & closed & (before < width) & (longer < width) & (width > 0)
-        width, closed = longer, closed | F.pad(blocked_left[:, :, depth:], (0, depth))
-    return corner
-
-
-def _shift(maps: Tensor, axis: int, by: Tensor) -> Tensor:
-    """Return maps ``[N, W, D]`` shifted towards 0 along an axis, by ``[N, 1, 1]`` cells; zeros come in."""
-    size = maps.shape[axis]
-    cell = torch.arange(size, device=maps.device).view(*[-1 if a == axis else 1 for a in range(3)])
-    source = (cell + by).expand_as(maps)
-    return maps.gather(axis, source.clamp(max=size - 1)) & (source < size)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from problems import late_state, occupancies, random_states
+from problems import late_state, occupancies, random_states, spaces_by_hand
 
 from pickplace import CellSpec, Item, PickPlaceEnv, State
 from pickplace.items.distributions import Uniform
@@ -17,24 +17,9 @@ from pickplace.rules.state import Failure, surface_from
 from pickplace.rules.step import apply
 
 
-def maximal_rectangles(free):
-    """Yield all ``(x, y, width, depth)`` of free cells of which no side can move outwards, by trying every one."""
-    wide, deep = len(free), len(free[0])
-
-    def is_free(x, y, w, d):
-        inside = x >= 0 and y >= 0 and x + w <= wide and y + d <= deep
-        return inside and all(free[i][j] for i in range(x, x + w) for j in range(y, y + d))
-
-    for x, y in itertools.product(range(wide), range(deep)):
-        for w, d in itertools.product(range(1, wide - x + 1), range(1, deep - y + 1)):
-            larger = ((x - 1, y, w + 1, d), (x, y - 1, w, d + 1), (x, y, w + 1, d), (x, y, w, d + 1))
-            if is_free(x, y, w, d) and not any(is_free(*each) for each in larger):
-                yield x, y, w, d
-
-
 @settings(max_examples=30)
 @given(seed=st.integers(0, 10**6), wide=st.integers(2, 6), deep=st.integers(2, 6), steps=st.integers(1, 4))
-def test_corners_of_maximal_rectangles(seed, wide, deep, steps):
+def test_corners_of_empty_spaces(seed, wide, deep, steps):
     generator = torch.Generator().manual_seed(seed)
     cell = CellSpec(tote_size=(wide, deep, 6))
     heights = torch.randint(steps, (3, wide, deep), generator=generator).int()
@@ -43,14 +28,13 @@ def test_corners_of_maximal_rectangles(seed, wide, deep, steps):
     maps = placing_maps(cell, State(surface_from(heights), torch.full((3,), 6), items))
     found = corner_footprints(cell, heights, maps)
     for n in range(3):
-        free = {z: list(maximal_rectangles((heights[n] <= z).tolist())) for z in range(steps)}
+        spaces = [*spaces_by_hand(heights[n].tolist())]
         for quarter_turned, (wide_, deep_) in enumerate(((int(w[n]), int(d[n])), (int(d[n]), int(w[n])))):
             expected = torch.zeros(wide, deep, dtype=torch.bool)
-            for z, rectangles in free.items():
-                for x, y, a, b in rectangles:
-                    if a >= wide_ and b >= deep_:
-                        for i, j in itertools.product((x, x + a - wide_), (y, y + b - deep_)):
-                            expected[i, j] |= int(maps.top[n, quarter_turned, i, j]) == z + int(h[n])
+            for z, x0, y0, x1, y1 in spaces:
+                if x1 - x0 >= wide_ and y1 - y0 >= deep_:
+                    for i, j in itertools.product((x0, x1 - wide_), (y0, y1 - deep_)):
+                        expected[i, j] |= int(maps.top[n, quarter_turned, i, j]) == z + int(h[n])
             assert torch.equal(found[n, quarter_turned], expected)
 
 

@@ -1,31 +1,16 @@
 """Planners of maximal empty spaces against a search over all rectangles, cell by cell."""
 
 import time
-from itertools import combinations, product
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from problems import SETTINGS, occupancies, random_states, results_by_hand, tie_by_hand
+from problems import SETTINGS, occupancies, random_states, results_by_hand, spaces_by_hand, tie_by_hand
 
 from pickplace import PickPlaceEnv
-from pickplace.planners.spaces import BestFit, OnlineBPH, empty_spaces
-
-
-def spaces_by_hand(heights):
-    """Return the floor and the sides ``(x0, y0, x1, y1)`` of each maximal empty space above heights ``[W][D]``."""
-    wide, deep = len(heights), len(heights[0])
-
-    def highest(x0, y0, x1, y1):
-        cells = product(range(x0, x1), range(y0, y1))
-        return max(heights[x][y] if 0 <= x < wide and 0 <= y < deep else 10**6 for x, y in cells)
-
-    for (x0, x1), (y0, y1) in product(combinations(range(wide + 1), 2), combinations(range(deep + 1), 2)):
-        floor = highest(x0, y0, x1, y1)
-        grown = (x0 - 1, y0, x1, y1), (x0, y0 - 1, x1, y1), (x0, y0, x1 + 1, y1), (x0, y0, x1, y1 + 1)
-        if all(highest(*box) > floor for box in grown):
-            yield floor, x0, y0, x1, y1
+from pickplace.planners.empty_spaces import empty_spaces
+from pickplace.planners.spaces import BestFit, OnlineBPH
 
 
 def best_space(planner, spaces, found, height, tote_height):
