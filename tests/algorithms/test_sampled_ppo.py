@@ -8,11 +8,13 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.modules import ValueOperator
 
+from pickplace.algorithms.base import BatchPosition
 from pickplace.algorithms.sampled_ppo import SampledPPO, taken_choice_advantages
 from pickplace.algorithms.sampled_softmax import CANDIDATE_KEYS, as_sampling_policy, draw_candidates
 from pickplace.policies.base import Policy
 from pickplace.policies.fcn4d.policy import Fcn4d
 from pickplace.policies.individual.policy import IndividualRl
+from pickplace.rules.observation import RESERVED
 from pickplace.training.train import train
 
 
@@ -47,6 +49,15 @@ def drawn(kind, steps):
     frames["next"] = env.step(frames.clone())["next"]
     env.load_state_dict(saved)
     return env, policy, frames
+
+
+@pytest.mark.parametrize("kind", [Fcn4d, IndividualRl])
+def test_no_term_may_have_the_name_of_what_is_learned_from(kind):
+    env, policy, frames = drawn(kind, 1)
+    algorithm = algorithm_of(policy, CRITIC, *SETTINGS)
+    data = algorithm.prepare(frames.detach().unsqueeze(1), BatchPosition(0, 24, 1, 24))
+    algorithm.objective(data)
+    assert {*CANDIDATE_KEYS, "advantage"} <= {*data.keys()} <= {*RESERVED, *env.terms}
 
 
 @pytest.mark.parametrize("kind", [Fcn4d, IndividualRl])
