@@ -1,5 +1,7 @@
 """Settings of all tests, and fixtures that several files use."""
 
+import importlib
+import io
 import logging
 import multiprocessing
 import shutil
@@ -12,8 +14,6 @@ from hydra._internal.hydra import Hydra
 from hydra.core.hydra_config import HydraConfig
 from hypothesis import HealthCheck, settings
 
-from pickplace.evaluation import command as evaluate
-from pickplace.training import command as train_command
 from pickplace.training import train
 from pickplace.training.trainer import Trainer
 
@@ -27,21 +27,29 @@ multiprocessing.set_start_method("forkserver", force=True)
 # Hydra's config files are read faster in C.
 yaml.SafeLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
-MAINS = {"train": train_command.main, "evaluate": evaluate.main}
+#: The module of each command, whose ``main`` it runs.
+COMMANDS = {
+    "train": "training.command", "evaluate": "evaluation.command", "plan": "serve.json_lines",
+    "export": "policies.export", "pack": "evaluation.pack_command",
+}  # fmt: skip
 
 
 @pytest.fixture
 def run(monkeypatch, tmp_path, capsys):
-    """Run a command in this process, in an empty folder; returns exit code, standard output and standard error."""
+    """Run a command in this process, in an empty folder; returns exit code, standard output and standard error.
+
+    ``lines``, bytes, are its standard input.
+    """
     monkeypatch.chdir(tmp_path)
     # Hydra would compose the whole config again to know its mode; the command has composed it already.
     monkeypatch.setattr(Hydra, "get_mode", lambda hydra, **given: HydraConfig.get().mode)
 
-    def call(command, *arguments):
-        monkeypatch.setattr(sys, "argv", [f"pickplace-{command}", *arguments])
+    def call(command, *arguments, lines=b""):
+        monkeypatch.setattr(sys, "argv", [f"pickplace-{command}", *map(str, arguments)])
+        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(lines)))
         code = 0
         try:
-            MAINS[command]()
+            importlib.import_module(f"pickplace.{COMMANDS[command]}").main()
         except SystemExit as exit:
             code = exit.code or 0
         finally:

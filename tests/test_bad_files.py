@@ -42,7 +42,7 @@ from pickplace.runs.folder import (
 from pickplace.runs.locate import locate
 from pickplace.runs.resume import StopRequest
 from pickplace.serve import json_lines
-from pickplace.serve.request import Limits
+from pickplace.serve.request import RequestLimits
 from pickplace.training import trainer
 from pickplace.training.train import resume_run, train
 
@@ -494,15 +494,13 @@ def test_any_optimizer_with_several_groups_is_restored(kind):
 
 
 @pytest.fixture
-def plan(monkeypatch, capsys):
-    """Run ``pickplace-plan`` in this process."""
+def plan(run):
+    """Run ``pickplace-plan``, which must refuse; returns its standard error."""
 
     def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["pickplace-plan", "pretrained/r4", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            json_lines.main()
-        assert end.value.code == 2
-        return capsys.readouterr().err
+        code, _, err = run("plan", "pretrained/r4", *arguments)
+        assert code == 2
+        return err
 
     return call
 
@@ -549,7 +547,7 @@ def test_an_endless_line_is_answered_and_skipped():
     lines = list(json_lines.read_lines(Endless(), 8))
     assert lines == [b"x" * 9, b"{}\n", b" " * 8 + b"\n", b"y" * 9]
     with pytest.raises(ValueError, match="more than 8 bytes"):
-        Limits(8, 10).check(lines[0])
+        RequestLimits(8, 10).check(lines[0])
 
 
 @pytest.mark.parametrize("name", ["stdin", "stdout"])

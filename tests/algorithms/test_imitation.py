@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from pickplace import PickPlaceEnv
-from pickplace.algorithms.base import At
+from pickplace.algorithms.base import BatchPosition
 from pickplace.algorithms.imitation import Imitation, WarmStart, imitation_loss
 from pickplace.config.registry import PLANNERS
 from pickplace.planners.heuristics import JointDBL
@@ -162,7 +162,8 @@ def test_phases_follow_each_other():
     inner.descend = lambda data, position, objective: "imitation" if "taught" in data else "critic"
     imitation = Imitation(inner, warm_start(config(frames=100, critic_frames=50))[0])
     imitation.warm_start.ask = lambda data, iteration: torch.zeros(len(data))
-    phases = [imitation.learn(TensorDict({}, [2, 3]), At(frames, 0, 1, 0)) for frames in (0, 99, 100, 149, 150)]
+    sent = [BatchPosition(frames, 0, 1, 0) for frames in (0, 99, 100, 149, 150)]
+    phases = [imitation.learn(TensorDict({}, [2, 3]), position) for position in sent]
     assert phases == ["imitation", "imitation", "critic", "critic", "reward"]
 
 

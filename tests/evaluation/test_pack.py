@@ -5,7 +5,6 @@ import json
 import math
 import random
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,6 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from scipy.spatial import ConvexHull
 
-from pickplace import cli
 from pickplace.common.validate import refuse_if
 from pickplace.evaluation.pack import OrderPacker
 from pickplace.items.order_file import ORIENTATIONS, OrderItem
@@ -279,17 +277,13 @@ def test_a_sheet_as_large_as_the_container():
 
 
 @pytest.fixture
-def pack(monkeypatch, capsys, tmp_path):
+def pack(run, tmp_path):
+    """Run ``pickplace-pack``; returns its folder, or standard error if it fails, and standard output."""
+
     def call(*words, code=0):
-        monkeypatch.setattr(sys, "argv", ["pickplace-pack", *map(str, words), "--out", str(tmp_path / "out")])
-        try:
-            cli.pack()
-            found = 0
-        except SystemExit as end:
-            found = end.code
-        out, err = capsys.readouterr()
+        found, out, err = run("pack", *words, "--out", tmp_path / "out")
         assert found == code, err
-        return tmp_path / "out" if code == 0 else err, out
+        return err if code else tmp_path / "out", out
 
     return call
 

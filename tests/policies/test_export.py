@@ -2,6 +2,7 @@
 
 import json
 import sys
+from functools import partial
 
 import pytest
 import torch
@@ -11,7 +12,7 @@ from test_footprint_fcn import by_hand, random_maps
 from torch.export import Dim
 
 from pickplace import CellSpec, PickPlaceEnv, __version__, load_policy
-from pickplace.policies import export, onnx_model
+from pickplace.policies import onnx_model
 from pickplace.policies.afterstate.policy import AfterstateFcn
 from pickplace.policies.base import MASKED
 from pickplace.policies.fcn4d.policy import Fcn4d
@@ -189,21 +190,8 @@ def test_its_best_feasible_footprint_is_the_planners(exported):
 
 
 @pytest.fixture
-def command(monkeypatch, capsys, tmp_path):
-    """Run ``pickplace-export`` in this process, in an empty folder; returns exit code, standard output and error."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["pickplace-export", *arguments])
-        code = 0
-        try:
-            export.main()
-        except SystemExit as exit:
-            code = exit.code or 0
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
-
-    return call
+def command(run):
+    return partial(run, "export")
 
 
 def test_the_command_replaces_a_file_when_the_check_has_passed(converted, command, tmp_path, monkeypatch):

@@ -1,9 +1,8 @@
 """``pickplace-plan``: one plan from files, and a process that answers JSON lines."""
 
-import io
 import json
-import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -27,22 +26,8 @@ ITEM[1:3, 2] = 1
 
 
 @pytest.fixture
-def command(monkeypatch, capsys, tmp_path):
-    """Run ``pickplace-plan`` in this process, in an empty folder; returns exit code, standard output and error."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments, lines=b""):
-        monkeypatch.setattr(sys, "argv", ["pickplace-plan", *map(str, arguments)])
-        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(lines)))
-        code = 0
-        try:
-            json_lines.main()
-        except SystemExit as exit:
-            code = exit.code or 0
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
-
-    return call
+def command(run):
+    return partial(run, "plan")
 
 
 @pytest.mark.parametrize(
