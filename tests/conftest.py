@@ -44,9 +44,10 @@ def run(monkeypatch, tmp_path, capsys):
     # Hydra would compose the whole config again to know its mode; the command has composed it already.
     monkeypatch.setattr(Hydra, "get_mode", lambda hydra, **given: HydraConfig.get().mode)
 
-    def call(command, *arguments, lines=b""):
+    def call(command, *arguments, lines=None):
         monkeypatch.setattr(sys, "argv", [f"pickplace-{command}", *map(str, arguments)])
-        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(lines)))
+        if lines is not None:
+            monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(lines)))
         code = 0
         try:
             importlib.import_module(f"pickplace.{COMMANDS[command]}").main()

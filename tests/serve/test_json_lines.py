@@ -27,7 +27,7 @@ ITEM[1:3, 2] = 1
 
 @pytest.fixture
 def command(run):
-    return partial(run, "plan")
+    return partial(run, "plan", lines=b"")
 
 
 @pytest.mark.parametrize(
