@@ -220,9 +220,11 @@ class OrderPacker:
                 support=support, bin_size=bins, tote_size=(length, width, self.container[2]), **self._settings
             )
         handling = any(item.has_limits for item in items)
+        least = min(w * d * _oriented(item, face[0])[2] for item, face, (w, d, *_) in variants)
         return replace(
-            cell, bin_items=len(self._faces), longest_side=max(wide, deep), handling=handling, most_items=len(items)
-        )
+            cell, bin_items=len(self._faces), longest_side=max(wide, deep), handling=handling,
+            most_items=min(len(items), int(length * width * self.container[2] / least + 1e-6)),
+        )  # fmt: skip
 
     def _fill(
         self, cell: CellSpec, planner: MapPlanner, tries: Sequence[tuple[Numbered, Faces]], number: int

@@ -4,8 +4,10 @@ import argparse
 import csv
 import io
 import json
+import math
 import re
 from collections.abc import Container
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -75,6 +77,7 @@ def run(args: argparse.Namespace) -> None:
     length, width, height = map(int, match.groups() if match else ())
     container = length, width, height
     refuse_if(not min(container), f"--container={args.container}: expected sides of 1 mm or more.")
+    from pickplace.common.files import replaced_file
     from pickplace.common.validate import one_of
     from pickplace.evaluation.pack import OrderPacker
     from pickplace.items.order_file import MILLIMETRES, read_orders
@@ -86,6 +89,7 @@ def run(args: argparse.Namespace) -> None:
     for order in orders:  # before the first of them is packed
         packer.check(order.items)
     folder, rows, recorded = Path(args.out), [], []
+    folder.mkdir(parents=True, exist_ok=True)
     bed_bpp: dict[str, list[dict]] = {}
     plans: list[EpisodePlan] = []
     for order in orders:
@@ -102,19 +106,19 @@ def run(args: argparse.Namespace) -> None:
             bed_bpp[key] = [_as_bed_bpp(packed) for packed in each.items]
             plans.append(_as_plan(len(plans), container, each))
         recorded.append(([each.recording for each in containers], cell, name))
-    folder.mkdir(parents=True, exist_ok=True)
     # The pages of an earlier run: other commands write no such plan.
     earlier = [path for path in folder.iterdir() if PAGE.fullmatch(path.name)] if (folder / "plan.csv").exists() else []
     columns = io.StringIO()
     writer = csv.DictWriter(columns, rows[0], lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    _write(folder, {
-        "plan.csv": columns.getvalue(), "plan.json": json.dumps(bed_bpp, indent=1) + "\n", PLANS: to_lines(plans),
-    })  # fmt: skip
     files = [f"replay_{number}.html" for number in range(1, len(orders) + 1)] if len(orders) > 1 else ["replay.html"]
-    for file, each_page in zip(files, recorded, strict=True):
-        _write(folder, {file: page(*each_page)})
+    with ExitStack() as replaced:  # the old files stay until all new ones are written
+        for name, text in (
+            ("plan.csv", columns.getvalue()), ("plan.json", json.dumps(bed_bpp, indent=1) + "\n"),
+            (PLANS, to_lines(plans)), *((file, page(*each)) for file, each in zip(files, recorded, strict=True)),
+        ):  # fmt: skip
+            replaced.enter_context(replaced_file(folder / name)).write_text(text, encoding="utf-8")
     for old in [path for path in earlier if path.name not in files]:
         old.unlink()
     pages = " to ".join(dict.fromkeys((files[0], files[-1])))
@@ -142,10 +146,10 @@ def _row(name: str, container: int, step: int, packed: "PackedItem") -> dict:
 
 def _text(name: str, place: int, count: int, container: "PackedContainer", rows: list[dict]) -> str:
     """Return the text that is printed for a container."""
-    weight = sum(row["weight/kg"] for row in rows)
+    weight, top = sum(row["weight/kg"] for row in rows), math.ceil(10 * container.top - 1e-6) / 10
     lines = [
         f"{name}, container {place} of {count}: {len(rows)} item{'s' * (len(rows) != 1)}, "
-        f"{container.occupancy:.1%} of its volume, {weight:,.1f} kg, {container.top:.0f} mm high"
+        f"{container.occupancy:.1%} of its volume, {weight:,.1f} kg, {top:g} mm high"
     ]
     keys = ("step", "item", "id", "x/mm", "y/mm", "z/mm", "along_x/mm", "along_y/mm", "height/mm")
     cells = [
@@ -190,11 +194,3 @@ def _as_plan(number: int, container: tuple[int, ...], packed: "PackedContainer")
         Placement(metres(each.corner), metres(each.size), mass=each.item.grams / 1000) for each in packed.items
     ]
     return EpisodePlan(number, metres(container), placements=placements)
-
-
-def _write(folder: Path, texts: dict[str, str]) -> None:
-    from pickplace.common.files import replaced_file
-
-    for name, text in texts.items():
-        with replaced_file(folder / name) as new:
-            new.write_text(text, encoding="utf-8")

@@ -43,6 +43,8 @@ YES_NO = {
 MILLIMETRES, GRAMS = {"mm": 1.0, "cm": 10.0, "m": 1000.0}, {"g": 1.0, "kg": 1000.0}
 UNITS: dict[str, dict] = {**dict.fromkeys(SIDES, MILLIMETRES), "weight": GRAMS, "max_load": GRAMS}
 DEFAULT_WEIGHT = "kg"
+#: Columns whose absence changes the plan: a column that is almost named like one of them is refused.
+OPTIONAL = ("quantity", "max_load", "stackable", "nothing_on_top", "orientations")
 COLUMN = re.compile(r"(.*?)\s*(?:[/_ (\[]\s*(mm|cm|m|kg|g)\s*[)\]]?)?")  # a name, and a unit if there is one
 EXPECTED = "columns length, width, height and weight, such as length/mm and weight/kg; and order, id or quantity if any"
 
@@ -183,6 +185,8 @@ def read_orders(path, unit: str = "mm", key: str = "items.path", target: str | N
             orders.setdefault(order, []).extend([shown] * quantity)
     words = "" if target is None else f" for target={target}, but for {excerpt([*targets])}"
     refuse_if(not orders, f"{path}: no items{words}, expected at least one.")
+    if len(orders) > 1 and "" in orders:
+        raise ValueError(f"{orders[''][0].place}: its order has no name; expected one in each line, or in none.")
     return [Order(_printable(name), items) for name, items in orders.items()]
 
 
@@ -208,7 +212,8 @@ def _rows_of_csv(path: Path, text: str) -> Iterator[_Row]:
             header, header_place = fields, place
             continue
         count = len(fields)
-        hint = "; decimals need a point" if count > len(header) and separator == "," else ""
+        hint = "; decimals need a point" if count > len(header) >= 4 and separator == "," else ""
+        hint = f"; {header_place} is taken for it" if len(header) == 1 else hint
         refuse_if(
             count != len(header),
             f"{path}, {place}: got {count} field{'s' * (count != 1)}, expected {len(header)} as in the header{hint}.",
@@ -239,7 +244,8 @@ def _rows_of_json(path: Path, text: str) -> Iterator[_Row]:
         for number in sorted(items, key=int):
             if not isinstance(items[number], dict):
                 raise wrong(f"order {excerpt(name)}, item {number} is {excerpt(items[number])}")
-            place, entries = f"order {_printable(name)}, item {number}", {**about, **items[number], "order": name}
+            own = {key: value for key, value in items[number].items() if str(key).lower() not in NAMES["order"]}
+            place, entries = f"order {_printable(name)}, item {number}", {**about, **own, "order": name}
             yield _Row(place, tuple(entries), tuple(entries.values()), place)
 
 
@@ -252,6 +258,11 @@ def _read_header(place: str, header: Sequence, unit: str, decimal: str) -> dict[
         name, suffix = match[1].replace(" ", "_").replace("-", "_"), match[2]
         known = name in {each for names in NAMES.values() for each in names}
         refuse_if(known and name in found, f"{place}: two columns {excerpt(name)}; expected one.")
+        words = re.sub(r"[^a-z0-9]+", "_", name).strip("_") + "_"
+        meant = [column for column in OPTIONAL if any(words.startswith(f"{each}_") for each in NAMES[column])]
+        if meant and not known:
+            in_units = " in g or kg" if meant[0] in UNITS else ""
+            raise ValueError(f"{place}: the column {excerpt(key)} is not known; expected {meant[0]}{in_units}.")
         found[name] = key, suffix
     # In l,w,h and length,width,height the width is the second side; in w,d,h and width,depth,height the first.
     is_second = {"length", "l"} & {*found} or not {"d", "depth"} & {*found}
@@ -302,8 +313,8 @@ def _read_row(place: str, row: Mapping, columns: dict[str, _Column]) -> tuple[Or
         key, unit, _ = columns[name]
         with suppress(TypeError, ValueError, OverflowError):
             if 0 < (number := columns[name].number(row)) * unit <= most:
-                return number * unit
-        expected = f"{columns[name].expected(row)} above 0, at most {most / unit:,g}"
+                return round(number * unit, 6)
+        expected = f"{columns[name].expected(row)} above 0, at most {most / unit:,.10g}"
         raise ValueError(f"{place}: {key}={excerpt(row[key])}: expected {expected}.")
 
     length, width, height = (read(name, MAX_LENGTH) for name in SIDES)

@@ -61,10 +61,13 @@ class Orders(ItemDistribution):
         self._examples: list[OrderItem] = []  # of each kind
         numbered = [[self._number(item, kinds) for item in order.items] for order in orders]
         distinct = list(dict.fromkeys(map(tuple, numbered)))
+        alike: dict[tuple, list[tuple[int, ...]]] = {}  # orders of the same sizes in cells, in any sequence
+        for order in distinct:
+            alike.setdefault(tuple(sorted(self.cells(self._examples[kind]) for kind in order)), []).append(order)
         refuse_if(
-            flag("items.split", split) and len(distinct) < 3,
-            f"items.path={str(path)!r}: the file has {len(distinct)} different orders; expected three at least, for "
-            "train, validation and test, or items.split=false, which tests with all orders.",
+            flag("items.split", split) and len(alike) < 3,
+            f"items.path={str(path)!r}: the file has {len(alike)} orders of different sizes; expected three at least, "
+            "for train, validation and test, or items.split=false, which tests with all orders.",
         )
         refuse_above(f"items.path={str(path)!r}: the file has", len(kinds), "kinds of items", MAX_KINDS)
         self.sizes = torch.tensor([self.cells(item) for item in self._examples])
@@ -74,7 +77,7 @@ class Orders(ItemDistribution):
         self.longest_episode = max(map(len, distinct))
         sides = torch.tensor([item[1:4] for item in self._examples], dtype=torch.float64)
         self.volumes = sides.prod(1) / (self._cell**2 * self._unit)
-        self._orders = _split(distinct) if split else {"train": [], "validation": [], "test": distinct}
+        self._orders = _split([*alike.values()]) if split else {"train": [], "validation": [], "test": distinct}
         self._lines = _Lines(self._orders["train"] or distinct)
         self._kept = EpisodeCache(self._play, max(1, 2**22 // self._lines.most))
 
@@ -164,13 +167,13 @@ class _Lines:
         return [kinds.repeat_interleave(count).tolist() for kinds, count in rows]
 
 
-def _split(orders: Sequence[Sequence[int]]) -> dict[str, list[Sequence[int]]]:
-    """Return the orders for training, validation and test."""
-    zeros = torch.zeros(len(orders), dtype=torch.int64)
-    numbers = hashed_uniform("train", zeros, zeros, torch.arange(len(orders)), 1)[0].argsort().tolist()
-    shuffled = [orders[number] for number in numbers]
+def _split(groups: Sequence[Sequence[Sequence[int]]]) -> dict[str, list[Sequence[int]]]:
+    """Return the orders for training, validation and test; a group of orders that are alike stays together."""
+    zeros = torch.zeros(len(groups), dtype=torch.int64)
+    numbers = hashed_uniform("train", zeros, zeros, torch.arange(len(groups)), 1)[0].argsort().tolist()
     parts, start = {}, 0
     for name, share in SHARES.items():
-        stop = start + max(1, round(share * len(orders)))
-        parts[name], start = shuffled[start:stop], stop
-    return {**parts, "train": shuffled[start:]}
+        stop = start + max(1, round(share * len(groups)))
+        parts[name], start = numbers[start:stop], stop
+    parts["train"] = numbers[start:]
+    return {name: [order for number in part for order in groups[number]] for name, part in parts.items()}

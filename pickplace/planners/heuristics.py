@@ -237,7 +237,7 @@ def corner_footprints(cell: CellSpec, heights: Tensor, maps: PlacingMaps) -> Ten
     level = maps.top - maps.item.h[:, None, None, None]
     for turned in range(cell.footprint_turns):
         w, d = (side[spaces.row] for side in (maps.item.w, maps.item.d)[:: 1 - 2 * turned])
-        fits = (spaces.x1 - spaces.x0 >= w) & (spaces.y1 - spaces.y0 >= d)
+        fits = (w > 0) & (spaces.x1 - spaces.x0 >= w) & (spaces.y1 - spaces.y0 >= d)  # a width of 0: no item
         row, floor, x0, y0, x1, y1 = (part[fits] for part in spaces)
         for x, y in product((x0, x1 - w[fits]), (y0, y1 - d[fits])):
             rests = level[row, turned, x, y] == floor

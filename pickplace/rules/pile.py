@@ -11,7 +11,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from pickplace.common.capture import is_capturing
 from pickplace.rules.item import NO_LIMIT, Item
+
+MANY_ITEMS = 128  # in a tote, beyond which it is faster to look at those only that are seen from above
 
 
 class Pile(NamedTuple):
@@ -42,9 +45,14 @@ class Pile(NamedTuple):
 
         -1 everywhere in a tote that has no room for another item.
         """
-        each = torch.where(self.below, self.spare[:, None], NO_LIMIT).amin(2)
-        floor = torch.full_like(each[:, :1], NO_LIMIT)
-        capacity = torch.cat([floor, each], 1).gather(1, self.labels.flatten(1)).view_as(self.labels)
+        labels, below = self.labels.flatten(1), self.below
+        if below.shape[1] > MANY_ITEMS and len(labels) and not is_capturing():  # only those that are seen from above
+            seen, labels = labels.unique(return_inverse=True)
+            shown = seen[seen > 0]
+            below, labels = below[:, shown - 1], labels + (len(shown) == len(seen))  # 0 remains the floor
+        each = torch.where(below, self.spare[:, None], NO_LIMIT).amin(2)
+        floor = each.new_full((len(each), 1), NO_LIMIT)
+        capacity = torch.cat([floor, each], 1).gather(1, labels).view_as(self.labels)
         return torch.where((self.num_items == self.spare.shape[1])[:, None, None], -1, capacity)
 
     def add(self, item: Item, index: Tensor, touched: Tensor, inside: Tensor) -> "Pile":

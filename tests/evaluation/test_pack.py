@@ -1,10 +1,12 @@
 """``pickplace-pack``: every item once, inside its container, apart from the others, and carried; files and errors."""
 
 import csv
+import io
 import json
 import math
 import random
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +22,7 @@ from pickplace.items.order_file import ORIENTATIONS, OrderItem
 from pickplace.physics.engine import build_engine
 from pickplace.physics.plans import read_plans
 from pickplace.rules.item import NO_LIMIT
+from pickplace.views import replay
 
 ORDERS = Path(__file__).resolve().parents[2] / "docs/examples/orders/orders.csv"
 CONTAINER, CELL = (419, 315, 250), 20  # whole cells leave 19 and 15 mm
@@ -210,13 +213,13 @@ def test_cells_that_an_item_fills_in_part_do_not_mislead(sizes):
 
 def test_tiny_items_and_orders_of_one_name_end(pack, tmp_path):
     """Orders keep apart, with one name in both files: those that differ by a control character, or clash with another
-    one's second container or with the file's name."""
+    one's second container."""
     (path := tmp_path / "a.csv").write_text(
         "order,l,w,h,kg\n7,300,200,200,1\n7,300,200,200,1\n7#2,60,50,20,1\n8,1e-7,50,20,1e-9\n8\x1b[31m,50,50,50,1\n"
-        "8\x1c[31m,50,50,50,1\n,50,50,50,1\na,50,50,50,1\n"
+        "8\x1c[31m,50,50,50,1\na,50,50,50,1\n"
     )
     folder, out = pack(path, "--container", "300x200x200")
-    names = ["7", "7#2'", "8", "8?[31m", "8?[31m'", "a", "a'"]
+    names = ["7", "7#2'", "8", "8?[31m", "8?[31m'", "a"]
     assert [*json.loads((folder / "plan.json").read_text())] == ["7", "7#2", *names[1:]]
     with (folder / "plan.csv").open() as file:
         assert [*dict.fromkeys(row["order"] for row in csv.DictReader(file))] == names
@@ -260,7 +263,42 @@ def test_all_orders_are_packed_before_the_first_file_and_old_pages_go(pack, tmp_
 
     monkeypatch.setattr(OrderPacker, "pack", fail)
     pack(path, "--container", "100x100x100", code=2)
-    assert not folder.exists()
+    assert not [*folder.iterdir()]
+    folder.rmdir()
+    folder.write_text("")
+    error, _ = pack(path, "--container", "100x100x100", code=2)  # before it packs
+    assert "File exists" in error and "late" not in error
+
+
+def test_the_rule_that_picks_first_packs_an_item_that_fits_tipped_only(pack, tmp_path):
+    (path := tmp_path / "a.csv").write_text("l,w,h,kg\n60,80,200,1\n60,80,40,1\n")
+    pack(path, "--container", "250x250x150", "--tipping", "--planner", "individual_heuristic")
+
+
+def test_a_name_that_the_terminal_cannot_show_loses_nothing(pack, tmp_path, monkeypatch):
+    (path := tmp_path / "a.csv").write_text("order,l,w,h,kg\n\u0410,10,20,30,1\n", encoding="utf-8")
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written := io.BytesIO(), encoding="ascii"))
+    folder, _ = pack(path, "--container", "300x300x250")
+    assert b"\\u0410, container 1 of 1: 1 item" in written.getvalue() and (folder / "replay.html").is_file()
+
+
+def test_a_failure_leaves_the_old_plan(pack, tmp_path, monkeypatch):
+    (path := tmp_path / "a.csv").write_text("l,w,h,kg\n50,50,50,1\n")
+    folder, _ = pack(path, "--container", "100x100x100")
+    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+    monkeypatch.setattr(replay, "page", lambda *_: refuse_if(True, "late"))
+    path.write_text("l,w,h,kg\n50,50,40,1\n")
+    pack(path, "--container", "100x100x100", code=2)
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
+
+
+def test_there_is_room_for_the_items_that_fit_a_container_only():
+    """Of a thousand items, so that loads take little memory; none is left out although heights are rounded up."""
+    items = [OrderItem("a", 100.0, 100.0, 62.1, 9, "line 1", max_load=10**6)] * 1000
+    packer = OrderPacker((200, 100, 312), 20)
+    cell, (first, *others) = packer.pack(items[:25])
+    assert cell.pile_room == 10 and [len(each.items) for each in (first, *others)] == [10, 10, 5]
+    assert packer._cell_for(items).pile_room == 10
 
 
 def test_an_order_is_checked_for_a_cell_that_is_too_fine():

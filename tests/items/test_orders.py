@@ -5,7 +5,7 @@ import json
 import math
 import pickle
 from collections import Counter
-from itertools import groupby
+from itertools import combinations, groupby
 
 import pytest
 import torch
@@ -88,6 +88,15 @@ def test_a_file_is_read_in_any_unit(tmp_path_factory, orders, unit, weight):
 def test_streams_share_no_order_and_play_each_once(tmp_path_factory, orders, sizes):
     cell, unit = sizes
     path = write_csv(tmp_path_factory.mktemp("orders") / "a.csv", orders, "m", weight="g")
+
+    def sizes_of(order):
+        return tuple(sorted(item[:3] for item in order))
+
+    alike = {sizes_of(in_cells(order, 1000 * cell, unit)) for order in orders}
+    if len(alike) < 3:
+        with pytest.raises(ValueError, match=f"has {len(alike)} orders of different sizes"):
+            Orders(path, cell, unit, generate=False)
+        return
     items = Orders(path, cell, unit, generate=False)
     played = {
         stream: [episode(items, stream, number) for number in range(items.num_episodes(stream) or 60)]
@@ -100,9 +109,40 @@ def test_streams_share_no_order_and_play_each_once(tmp_path_factory, orders, siz
     assert all(order in expected for each in played.values() for order in each)
     counts = {stream: items.num_episodes(stream) for stream in ("validation", "test")}
     assert all(count >= 1 for count in counts.values()) and sum(counts.values()) < len(orders)
-    # Orders that differ in the file may be alike in cells, so kinds are compared as they stand there.
+    # Orders that are alike in cells are in one stream, in whatever sequence; each that differs in the file is played.
+    assert all(not one & other for one, other in combinations([{*map(sizes_of, each)} for each in played.values()], 2))
     whole = {stream: [tuple(order) for order in items._orders[stream]] for stream in played}
     assert len({*whole["train"], *whole["validation"], *whole["test"]}) == len(orders) == sum(map(len, whole.values()))
+
+
+@pytest.mark.parametrize(("header", "message"), [
+    ("max_load/lb", "the column 'max_load/lb' is not known; expected max_load in g or kg."),
+    ("Max. load (t)", "the column 'Max. load \\(t\\)' is not known; expected max_load in g or kg."),
+    ("Stackable?", "the column 'Stackable\\?' is not known; expected stackable."),
+    ("Quantity (pcs)", "the column 'Quantity \\(pcs\\)' is not known; expected quantity."),
+    ("orientations allowed", "expected orientations."), ("qty per line", "expected quantity."),
+])  # fmt: skip
+def test_a_column_that_is_almost_named_like_a_limit_is_refused(tmp_path, header, message):
+    (path := tmp_path / "a.csv").write_text(f"l,w,h,kg,colour,{header}\n1,2,3,4,red,1\n")
+    with pytest.raises(ValueError, match=f"a.csv, line 1: .*{message}"):
+        read_orders(path)
+
+
+def test_an_order_without_a_name_among_others_is_refused(tmp_path):
+    (path := tmp_path / "a.csv").write_text("order,l,w,h,kg\n7,1,2,3,4\n,1,2,3,4\n")
+    with pytest.raises(ValueError, match=r"line 3: its order has no name; expected one in each line, or in none"):
+        read_orders(path)
+
+
+def test_sizes_are_equal_in_any_unit(tmp_path):
+    (path := tmp_path / "a.csv").write_text("l/m,w/cm,h,kg\n1.003,100.3,69,1\n")
+    assert read_orders(path)[0].items[0][1:4] == (1003, 1003, 69)
+
+
+def test_an_order_in_bed_bpp_is_named_by_its_key(tmp_path):
+    box = {"order_id": 9, "length/mm": 1, "width/mm": 2, "height/mm": 3, "weight/kg": 4}
+    (path := tmp_path / "a.json").write_text(json.dumps({"x": {"item_sequence": {"1": box}}}))
+    assert [order.name for order in read_orders(path)] == ["x"]
 
 
 def test_drawn_orders_are_made_of_the_lines_of_those_that_train(tmp_path):
@@ -136,19 +176,19 @@ def test_drawn_orders_are_made_of_the_lines_of_those_that_train(tmp_path):
 
 
 def test_true_volumes_are_reported(tmp_path):
-    orders = [[(95 + n, 100, 41, 100)] * 3 for n in range(3)]
+    orders = [[(95 + n, 100, 41 + 50 * n, 100)] * 3 for n in range(3)]
     items = Orders(write_csv(tmp_path / "a.csv", orders), 0.05)
-    assert items.sizes.tolist() == [[2, 2, 1]] * 3
+    assert items.sizes.tolist() == [[2, 2, 1], [2, 2, 2], [2, 2, 3]]
 
     def make_env(first, count):
         return PickPlaceEnv(items, num_envs=count, stream="test", first_episode=first, masks=())
 
     episodes = play(make_env, JointDBL(make_env(0, 1).cell), 1, 1)
-    assert episodes.items_placed.tolist() == episodes.num_items.tolist() == [3] and episodes.occupancy.tolist() == [
-        12 / 180
-    ]
-    number = [order[0][0] for order in orders][items._orders["test"][0][0]]
-    assert episodes.true_occupancy.tolist() == [pytest.approx(3 * number * 100 * 41 / (300 * 300 * 250))]
+    number = items._orders["test"][0][0]
+    assert episodes.items_placed.tolist() == episodes.num_items.tolist() == [3]
+    assert episodes.occupancy.tolist() == [12 * (number + 1) / 180]
+    volume = 3 * math.prod(orders[number][0][:3])
+    assert episodes.true_occupancy.tolist() == [pytest.approx(volume / (300 * 300 * 250))]
     with pytest.raises(ValueError, match=r"^evaluation.episodes=2: the items of evaluation.stream=test have 1 "):
         check_play({"episodes": 2, "batch_size": 1, "stream": "test"}, make_env(0, 1))
 
@@ -161,6 +201,8 @@ def test_true_volumes_are_reported(tmp_path):
         ("l,w,h,kg\n1,2,3,nan\n", r"line 2: kg='nan': expected a number above 0"),
         ("l,w,h,kg\n\n1,2,99999,4\n", r"line 3: h='99999': expected a number above 0, at most 10,000\."),
         ("l,w,h,kg\n1,2,3\n", r"line 2: got 3 fields, expected 4 as in the header\."),
+        ("# boxes\nl,w,h,kg\n", r"line 2: got 4 fields, expected 1 as in the header; line 1 is taken for it\."),
+        ("l,w,h,g\n1,2,3,0\n", r"line 2: g='0': expected a number above 0, at most 10,000,000\."),
         ("l,w,h,kg\n1,2,3,4,5\n", r"line 2: got 5 fields, expected 4 as in the header; decimals need a point\."),
         ("l,w,h,kg\n1\n", r"line 2: got 1 field, expected 4 as in the header\."),
         ('l,w,h,kg\n1,2,"3,5",4\n', r"line 2: h='3,5': expected a number with a decimal point above 0, at most 10,000"),
@@ -187,7 +229,7 @@ def test_true_volumes_are_reported(tmp_path):
         (f"order,l,w,h,kg\n{101 * 'a'},1,2,3,4\n", r"line 2: order='a.*': expected at most 100 characters\."),
         ("id,l,w,h,kg\na,1,2,3,4\na,1,2,3,5\n", r"line 3: item 'a' is 1 x 2 x 3 mm, 5 kg, but 1 x 2 x 3 mm, 4 kg in"),
         ("l,w,h,kg\n", r"no items, expected at least one\."),
-        ("l,w,h,kg\n1,2,3,4\n", r"the file has 1 different orders; expected three at least"),
+        ("l,w,h,kg\n1,2,3,4\n", r"the file has 1 orders of different sizes; expected three at least"),
     ],
 )  # fmt: skip
 def test_a_bad_file_is_refused_with_its_line(tmp_path, text, message):
@@ -276,7 +318,7 @@ def test_orders_for_a_target_all_of_them_to_test_on(tmp_path, kind):
     assert Orders(path, 0.01, split=False).num_episodes("test") == 3 == len(read_orders(path))
     with pytest.raises(ValueError, match=r": no items for target=van, but for \['pallet', 'cage'\], expected at"):
         read_orders(path, target="van")
-    with pytest.raises(ValueError, match="^items.path=.* the file has 2 different orders; expected three at least"):
+    with pytest.raises(ValueError, match="^items.path=.* has 2 orders of different sizes; expected three at least"):
         Orders(path, 0.01, target="pallet")
     with pytest.raises(ValueError, match="^items.target=3: expected a name"):
         Orders(path, 0.01, target=3)
@@ -339,7 +381,7 @@ def test_limits_are_obeyed(tmp_path):
     """Pairs of a table that bears nothing and a cup: they lie side by side, and the table as it does in the bin."""
     lines = [f"{n},2{n},30,10,1,0,fixed\n{n},10,10,10,1,,\n" for n in range(4)]
     (path := tmp_path / "a.csv").write_text("order,l,w,h,kg,max_load,orientations\n" + "".join(lines))
-    items = Orders(path, 0.01)
+    items = Orders(path, 0.01, split=False)
     assert sorted({*map(tuple, items.handling.tolist())}) == [(5, 1000, 0), (15, 1000, NO_LIMIT)]
     settings = {"bin_size": (3, 3, 1), "tote_size": (3, 4, 3), "stream": "test", "num_envs": 1}
     with pytest.raises(ValueError, match=r"env.handling=false: the items have greatest loads or turns of their own"):

@@ -14,6 +14,7 @@ from pickplace.items.distributions import Kinds
 from pickplace.planners.lookahead import Lookahead
 from pickplace.planners.mcts import MCTS
 from pickplace.policies.fcn_grasp.policy import FcnGrasp
+from pickplace.rules import pile as rules_of_piles
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import NO_LIMIT, Item
 from pickplace.rules.masks import choice_mask, first_action_reaching, placing_maps
@@ -89,6 +90,23 @@ def test_placing_is_the_same_by_action_and_by_footprint_and_survives_an_observat
             and capacity.shape[1:] == env.surface.shape[1:]
         )
     assert overloaded > 20
+
+
+@pytest.mark.parametrize("settings", [SETTINGS[0], SETTINGS[6]])
+def test_capacity_needs_only_the_items_that_are_seen_from_above(settings, monkeypatch):
+    """Of each item, counted one by one; also where no floor is seen any more."""
+    piles = [env.state.pile for env, _ in random_states(**with_handling(settings))]
+    piles.append(piles[0]._replace(labels=piles[0].labels.clamp(min=1)))
+    for pile in piles:
+        for many in (0, 10_000):
+            monkeypatch.setattr(rules_of_piles, "MANY_ITEMS", many)
+            for n in range(len(pile.labels)):
+                expected = [
+                    NO_LIMIT if label == 0 else min([*pile.spare[n][pile.below[n, label - 1]].tolist(), NO_LIMIT])
+                    for label in pile.labels[n].flatten().tolist()
+                ]
+                assert pile.rows([n]).capacity.flatten().tolist() == expected
+            assert pile.capacity.equal(torch.cat([pile.rows([n]).capacity for n in range(len(pile.labels))]))
 
 
 def test_searches_know_the_loads():
