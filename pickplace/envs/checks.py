@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from pickplace.common.capture import is_capturing
-from pickplace.common.validate import refuse_above
+from pickplace.common.validate import refuse_above, refuse_if
 from pickplace.items.distributions import ItemDistribution
 from pickplace.items.tipping import longest_side
 from pickplace.rules.cell import CellSpec
@@ -45,6 +45,30 @@ def _corners(cell: CellSpec, items: ItemDistribution, kind: int) -> Iterable[tup
     near = max(cell.gripper.size)
     free = [side - int(own) for side, own in zip(cell.bin_size, items.sizes[kind, :2], strict=False)]
     return product(*(sorted({*range(min(near, most) + 1), *range(max(0, most - near), most + 1)}) for most in free))
+
+
+def check_samples(cell: CellSpec, items: ItemDistribution, stream: str) -> None:
+    """Refuse a user's items that a resumed run, or the rules, could not use.
+
+    Raises:
+        ValueError: if equal arguments give other items, or if an item has another size, place or handling than it may.
+    """
+    if type(items).__module__.partition(".")[0] == "pickplace":  # these have tests of their own
+        return
+    name, limits = f"items: {type(items).__name__}.sample", torch.tensor(cell.bin_size[:2])
+    address = torch.arange(16).repeat_interleave(4), torch.arange(4).repeat(16)
+    item, again = (items.sample(stream, torch.zeros(64, dtype=torch.int64), *address, cell.bin_size) for _ in range(2))
+    refuse_if(not item.table.equal(again.table), f"{name} gave other items for the same seed, episode and step.")
+    there = item.exists
+    sizes = (item.table[:, None, 2:5] == items.sizes).all(-1).any(1)
+    refuse_if(not (sizes | ~there).all(), f"{name} gave an item of a size that is not in `sizes`.")
+    corner, size = item.table[:, :2], item.table[:, 2:4]
+    inside = ((corner >= 0) & (corner + size <= limits)).all(1)
+    refuse_if(not (inside | ~there).all(), f"{name} gave an item outside the bin of {cell.bin_size[:2]} cells.")
+    if items.handling is not None:
+        handling = torch.stack([item.turns, item.grams, item.max_load], 1)
+        known = (handling[:, None] == items.handling).all(-1).any(1)
+        refuse_if(not (known | ~there).all(), f"{name} gave an item without its `handling`; of_kind() adds it.")
 
 
 def check_items(cell: CellSpec, items: ItemDistribution, mix: int = 0, turns: int = ALL_TURNS) -> None:

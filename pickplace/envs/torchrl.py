@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase
 from pickplace.common.capture import any_of, is_capturing
 from pickplace.common.machine import usable_device
 from pickplace.common.validate import check_bytes, expect, one_of, or_null, refuse_if, whole_number
-from pickplace.envs.checks import check_items, check_numbers, most_items, problem_bytes, require
+from pickplace.envs.checks import check_items, check_numbers, check_samples, most_items, problem_bytes, require
 from pickplace.envs.episode import RESET_ENTRIES, SETTINGS
 from pickplace.envs.masks import MASKS, MaskMaker
 from pickplace.items.arrival import coming_items, refill
@@ -21,7 +21,7 @@ from pickplace.items.tipping import check_tipping, longest_side, sizes_in_bin
 from pickplace.rules.bin import may_arrive, remove_item
 from pickplace.rules.cell import CELL_SETTINGS, cell_from_settings
 from pickplace.rules.item import ALL_TURNS, Item
-from pickplace.rules.observation import Term, check_terms, observe
+from pickplace.rules.observation import Term, check_terms, observe, standard_terms
 from pickplace.rules.pile import Pile
 from pickplace.rules.state import EMPTY, EpisodeSettings, Failure, State
 from pickplace.rules.step import apply
@@ -132,6 +132,7 @@ class PickPlaceEnv(EnvBase):
         if cell.handling:
             cell = replace(cell, most_items=most_items(cell, items))
         self.items, self.cell, self.terms = items, cell, check_terms(observation, cell)
+        check_samples(cell, items, stream)
         check_items(cell, items)
         check_tipping(cell, items)
         # Mixes and rotations with which every item fits the empty tote.
@@ -153,6 +154,8 @@ class PickPlaceEnv(EnvBase):
             key: Bounded(low, high, (num_envs, *shape), dtype=dtype, device=device)
             for key, (low, high, shape, dtype) in self.bounds.items()
         }
+        own = self.terms.keys() - standard_terms(self.cell).keys()
+        self._own_terms = {key: (tuple(specs[key].shape), specs[key].dtype) for key in own}
         specs["occupancy"] = Bounded(0, 1, (num_envs, 1), dtype=torch.float32, device=device)
         specs["failure"] = Categorical(len(Failure), (num_envs, 1), dtype=torch.int64, device=device)
         sizes = {f"{name}_mask": MASKS[name].size(self.cell) for name in self.masks}
@@ -369,6 +372,10 @@ class PickPlaceEnv(EnvBase):
     def _observation(self) -> TensorDictBase:
         """Return the observation, with ``failure`` 0."""
         observation = observe(self.terms, self.cell, self.state)
+        for key, (shape, dtype) in self._own_terms.items():
+            if (found := observation[key]).shape != shape or found.dtype != dtype:
+                got = f"observation.{key}: its value is {found.dtype} of shape {tuple(found.shape)}"
+                raise ValueError(f"{got}, expected {dtype} of shape {shape}, as its bounds say.")
         observation["occupancy"] = self.exact_occupancy.float()[:, None]
         observation["failure"] = torch.zeros_like(self.tote_height)[:, None]
         for name in self.masks:

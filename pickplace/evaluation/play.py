@@ -2,11 +2,12 @@
 
 import logging
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.envs.utils import step_mdp
 
 from pickplace.common.validate import check_bytes, one_of, refuse_if, whole_number
@@ -206,6 +207,19 @@ def play(
         decisions=decisions,
         recordings=recordings,
     )
+
+
+@contextmanager
+def evaluation_mode(*modules: nn.Module) -> Iterator[None]:
+    """Within this context, modules are as in ``pickplace-evaluate``: dropout and batch statistics are not used."""
+    parts = {part: part.training for module in modules for part in module.modules()}
+    for module in modules:
+        module.eval()
+    try:
+        yield
+    finally:
+        for part, training in parts.items():
+            part.training = training
 
 
 @torch.no_grad()

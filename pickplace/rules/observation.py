@@ -244,6 +244,9 @@ HANDLING_TERMS: Mapping[str, Term] = {
     "pile_below": PilePart("below"),
 }
 
+#: Entries that only some cells have. From their presence the rules know the cell.
+OPTIONAL_TERMS = ("bin_labels", "items", "coming", *HANDLING_TERMS, *EPISODE_TERMS)
+
 #: Keys of the environment, the policies and the learner that no term may have.
 RESERVED = (
     "action", "action_mask", "footprint_mask", "corner_mask", "occupancy", "failure", "reward", "done", "terminated",
@@ -287,9 +290,10 @@ def check_terms(terms: Mapping[str, Term] | None, cell: CellSpec = PAPER_CELL) -
     for key, term in given.items():
         place = f"observation.{short_text(key)}"
         expect(isinstance(term, Term), place, term, "a Term, such as pickplace.rules.observation.ToteDepth")
+        taken = {*RESERVED, *OPTIONAL_TERMS} - standard.keys()
         refuse_if(
-            not isinstance(key, str) or key in RESERVED or not key.isidentifier(),
-            f"{place}: expected another name; taken are {', '.join(RESERVED)}.",
+            not isinstance(key, str) or key in taken or key.endswith("_mask") or not key.isidentifier(),
+            f"{place}: expected another name; taken are *_mask, {', '.join(sorted(taken))}.",
         )
     found = {**standard, **given}
     for key, term in standard.items():

@@ -4,7 +4,7 @@ import json
 from typing import Any
 
 from pickplace.common.errors import sentence
-from pickplace.common.validate import expect, number, or_null, refuse_if, whole_number
+from pickplace.common.validate import expect, number, or_null, refuse_if, reword_errors, whole_number
 from pickplace.config.registry import build
 from pickplace.evaluation.play import Episodes
 from pickplace.runs.loggers import check_metrics
@@ -134,12 +134,13 @@ def call(callbacks: dict[str, Callback], hook: str, trainer: Any, *arguments: An
     """Call a hook of each callback.
 
     Raises:
-        ValueError: naming the callback, for a metric that it removes or that no logger can write.
+        ValueError: naming the callback, if it fails, or for a metric that it removes or that no logger can write.
     """
     metrics = arguments[-1] if isinstance(arguments[-1], dict) else {}
     for name, callback in callbacks.items():
-        before = dict(metrics)
-        getattr(callback, hook)(trainer, *arguments)
+        before, where = dict(metrics), f"callbacks.{name}.{hook}"
+        with reword_errors(Exception, lambda error: ValueError(f"{where} failed: {sentence(error)}")):  # noqa: B023
+            getattr(callback, hook)(trainer, *arguments)
         for key in before:
             refuse_if(
                 key not in metrics, f"callbacks.{name}: it removes {key} from the metrics; expected changed values."

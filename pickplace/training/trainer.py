@@ -21,7 +21,7 @@ from pickplace.common.machine import use_machine
 from pickplace.common.validate import excerpt, expect, refuse_if
 from pickplace.config.registry import build
 from pickplace.envs.saved_state import check_saved_states
-from pickplace.evaluation.play import Episodes, play
+from pickplace.evaluation.play import Episodes, evaluation_mode, play
 from pickplace.evaluation.result import confidence95
 from pickplace.policies.base import EstimatesValue, Policy, as_critic, refuse_large_network
 from pickplace.policies.restore import differences
@@ -147,7 +147,8 @@ class Trainer:
         for warning in self.policy.check_sizes():
             log.warning("%s The training goes on all the same.", warning)
         full = self.env.cell
-        self.planner = build("planner", cfg.planner, cell=full, policy=self.policy.with_cell(full))
+        self.validated = self.policy.with_cell(full)
+        self.planner = build("planner", cfg.planner, cell=full, policy=self.validated)
         self.warm_start = WarmStart(cfg.warm_start, self.policy, env, cfg.seed, cfg.trust, self.frames)
         self.critic = None
         if isinstance(self.policy, EstimatesValue):
@@ -230,6 +231,10 @@ class Trainer:
                     check_saved_states(self.training_env, saved)
                     self.collector.load_state_dict(saved)
                     push_level(self.collector, self.curriculum.level, self.curriculum.weights)
+                # Building the collector has made a step, which may have changed buffers, such as running means.
+                for key, module in (("policy", self.policy), ("critic", self.critic)):
+                    if module is not None:
+                        module.load_state_dict(self.state[key])
                 # Last: everything above may have drawn.
                 random = checkpoint.matching_state(self.state, collectors.rng_state(self.device), "random generator")
                 collectors.set_rng_state(random, self.device)
@@ -278,28 +283,27 @@ class Trainer:
         """Play the full task on the validation stream, and record the episodes of these numbers."""
         evaluation = self.cfg.evaluation
         make_env = partial(self.build_env, stream=evaluation.stream, seed=evaluation.seed)
-        return play(
-            lambda first, count: make_env(first_episode=first, num_envs=count),
-            self.planner,
-            evaluation.episodes,
-            evaluation.batch_size,
-            record,
-        )
+        with evaluation_mode(self.policy, self.validated):
+            return play(
+                lambda first, count: make_env(first_episode=first, num_envs=count),
+                self.planner, evaluation.episodes, evaluation.batch_size, record,
+            )  # fmt: skip
 
     def finish_batch(self, metrics: dict, before: int) -> None:
         """Validate, log, save and print progress if their intervals ended between ``before`` and now."""
         cfg, frames = self.cfg, self.frames
         callbacks.call(self.callbacks, "on_batch", self, metrics)
         interval = cfg.evaluation_interval or -(-cfg.total_frames // VALIDATIONS)
-        if self.is_complete or has_passed(before, frames, interval):
+        if validates := self.is_complete or has_passed(before, frames, interval):
             self.episodes = self.validate()
             self.latest = validation_metrics(self.episodes)
             metrics |= {f"eval/{key}": value for key, value in self.latest.items()}
             log.info("%s frames: validation occupancy %.4f", f"{frames:,}", self.latest["occupancy"])
             callbacks.call(self.callbacks, "on_validation", self, self.episodes, metrics)
-        self.logger.log(metrics, frames)
+        # Whatever counts as a number, such as true or a numpy float, is written as one.
+        self.logger.log({key: each if type(each) is int else float(each) for key, each in metrics.items()}, frames)
         # After the row was logged: a run that is resumed from this checkpoint needs it.
-        if "eval/occupancy" in metrics and self.latest["occupancy"] > self.best:
+        if validates and self.latest["occupancy"] > self.best:
             self.best = self.latest["occupancy"]
             self.save("best")
         if has_passed(before, frames, cfg.checkpoint_interval):
@@ -349,14 +353,11 @@ class Trainer:
             log.info(
                 "the curriculum came to %s %d of %d only, so the policy was not trained above it; "
                 "train longer, or let a level end sooner (curriculum.advance, see docs/curriculum.md)",
-                self.curriculum.level_name,
-                level,
-                end,
-            )
+                self.curriculum.level_name, level, end,
+            )  # fmt: skip
         if not rows:
             return
-        levels = self.curriculum.level_name, end
-        learning_curve(table, run_dir / "learning_curve.png", levels, self.ended)
+        learning_curve(table, run_dir / "learning_curve.png", (self.curriculum.level_name, end), self.ended)
         # Without a validation, such as after logger=none, there is nothing to report.
         is_validated = self.best >= 0 and any("eval/occupancy" in row for row in rows)
         # If this process has no episodes, nothing was trained since the report was written.

@@ -1,6 +1,5 @@
 """An item distribution of your own: several items of the same kind arrive in a row."""
 
-from pickplace import Item
 from pickplace.items.distributions import Kinds, hashed_uniform
 
 
@@ -22,8 +21,5 @@ class Batches(Kinds):
     def sample(self, stream, seed, episode, step, bin_size, mix=None):
         """Return the ``step``-th item of each episode, int64 ``[N]``; a function of its arguments alone."""
         (kind,) = hashed_uniform(stream, seed, episode, step // self.run, 1)
-        w, d, h = self.sizes.to(step.device)[self._index(kind, step, mix)].unbind(-1)
         _, across, along = hashed_uniform(stream, seed, episode, step, 3)
-        x = (across * (bin_size[0] - w + 1)).long()
-        y = (along * (bin_size[1] - d + 1)).long()
-        return Item(x, y, w, d, h)
+        return self.of_kind(self._index(kind, step, mix), across, along, bin_size)

@@ -78,7 +78,9 @@ class Curriculum:
         self.start, self.end = self.levels.first, self.levels.last
         first = self.advance.setup(self.start, self.end, integral_number("total_frames", total_frames))
         self.tally = Tally(self._clamped(first), deque(maxlen=self.advance.window))
-        _ = self._rule_state(), self.weights  # raise here, not at the first checkpoint
+        self._numbers: set[str] = set()
+        state, _ = self._rule_state(), self.weights  # raise here, not at the first checkpoint
+        self._numbers = {key for key, value in state.items() if isinstance(value, Real)}
 
     @property
     def level(self) -> int:
@@ -191,6 +193,8 @@ class Curriculum:
         state = {key: deepcopy(getattr(self.advance, key)) for key in self.advance.state_keys}
         for key, value in state.items():
             expect(_is_json(value), f"{self._rule}: its state has {key}", value, "what JSON holds, numbers finite")
+            is_changed = key in self._numbers and not isinstance(value, Real)
+            expect(not is_changed, f"{self._rule}: its state has {key}", value, "a number, as at the start")
         return state
 
     def state_dict(self) -> dict:
@@ -221,8 +225,8 @@ class Curriculum:
         expect(isinstance(state["window"], list), key("window"), state["window"], "a list of numbers between 0 and 1")
         window = deque((number(key("window"), value, most=1) for value in state["window"]), self.advance.window)
         for name, value in rule.items():
-            kind = next(kind for kind in (Real, object) if isinstance(getattr(self.advance, name), kind))
-            expect(_is_json(value) and isinstance(value, kind), key(name), value, "a number")
+            fits = _is_json(value) and (name not in self._numbers or isinstance(value, Real))
+            expect(fits, key(name), value, "a number")
         self.tally = Tally(level, window, frames, counts["level_start"], counts["episodes"])
         self.advance.load_state(deepcopy(rule))
 
