@@ -261,7 +261,11 @@ def own_values(cfg: DictConfig) -> DictConfig:
         except ConfigCompositionException:  # an option that depends on those of other groups
             continue
         group = choice.get_key_element().lstrip("+~")  # as Hydra lists it, such as planner@warm_start.teacher
-        if str(before.hydra.runtime.choices.get(group)) != str(choice.value()):
+        if isinstance(choice.value(), list):  # Hydra lists no choice of several options
+            is_other = {*(_part_at(before, place) or ())} != {*own}
+        else:
+            is_other = str(before.hydra.runtime.choices.get(group)) != str(choice.value())
+        if is_other:
             cfg = cfg.copy()
             if place in SHARED_GROUPS:
                 merged = _part_at(cfg, place)
@@ -304,7 +308,8 @@ def _package_and_places(override: Override, search: list[str]) -> tuple[str | No
     """
     group = override.key_or_group
     options = group_options(group, search)
-    if not options or isinstance(override.value(), (dict, list)):
+    value: Any = override.value()  # options of callbacks are a list
+    if not options or isinstance(value, dict) or (isinstance(value, list) and not {*map(str, value)} <= {*options}):
         return None, [group]
     own = override.package or group.replace("/", ".")
     package: Any = override.package or _package(group, options)

@@ -249,7 +249,7 @@ OPTIONAL_TERMS = ("bin_labels", "items", "coming", *HANDLING_TERMS, *EPISODE_TER
 
 #: Keys of the environment, the policies and the learner that no term may have.
 RESERVED = (
-    "action", "action_mask", "footprint_mask", "corner_mask", "occupancy", "failure", "reward", "done", "terminated",
+    "action", "occupancy", "failure", "reward", "done", "terminated",
     "truncated", "next", "footprint", "grasp", "place_rotation", "logits", "log_prob", "candidates",
     "candidate_log_prob", "candidate_log_weight", "candidate_logits", "advantage", "state_value", "value_target",
     "taught", "_reset",

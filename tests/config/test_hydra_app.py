@@ -175,6 +175,8 @@ OWN_VALUES = [
     ("experiment=wide items=tall", {"items.width": [1, 2]}),
     ("experiment=wide items=mixed", {"items.width": [1, 1]}),
     ("experiment=wide callbacks=[early_stopping]", {"callbacks.early_stopping.patience": 5}),
+    ("experiment=wide callbacks=[second]", {"callbacks": {"second": {"_target_": "early_stopping", "patience": 2}}}),
+    ("experiment=wide callbacks=[second] callbacks.second.patience=7", {"callbacks.second.patience": 7}),
     ("curriculum=careful curriculum.sample.share='${..advance.occupancy}'", {"curriculum.sample.share": 0.85}),
     ("experiment=mine curriculum/advance=plateau", {"curriculum.advance": PLATEAU}),
     ("experiment=mine curriculum=paper", {"curriculum.advance": {"_target_": "frames", "frames_per_level": 5_000_000}}),
@@ -201,7 +203,8 @@ OWN_VALUES = [
 def search(tmp_path):
     """Returns the override that adds folders with config files of the user's."""
     files = {"experiment/mine": MINE, "experiment/wide": WIDE, "experiment/far": FAR}
-    for name, text in {**files, "env/own_cell": OWN_CELL, "curriculum/slow": SLOW}.items():
+    files |= {"callbacks/second": "second: {_target_: early_stopping, patience: 2}\n", "curriculum/slow": SLOW}
+    for name, text in {**files, "env/own_cell": OWN_CELL}.items():
         (tmp_path / "conf" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "conf" / f"{name}.yaml").write_text(text)
     return f"hydra.searchpath=[file://{tmp_path}/conf,file://{CURRICULA}]"

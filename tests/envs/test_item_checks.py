@@ -1,12 +1,40 @@
 """The check of items before an environment is made."""
 
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pickplace import CellSpec
+from pickplace import CellSpec, Item, PickPlaceEnv
 from pickplace.envs import checks
 from pickplace.items.distributions import Kinds
+
+
+class Drawn(Kinds):
+    """A user's kinds, of which only the first may arrive, with one fault."""
+
+    def __init__(self, fault, **handling):
+        super().__init__([(2, 1, 1), (1, 1, 1)], **handling)
+        self.fault, self.calls = fault, 0
+
+    def sample(self, stream, seed, episode, step, bin_size, mix=None):
+        self.calls += 1
+        zero = torch.zeros_like(episode)
+        w = zero + {"size": 3}.get(self.fault, 2)
+        x = (episode + step) % 4 + (self.fault == "outside") + (self.calls if self.fault == "random" else 0)
+        return Item(x.clamp(max=4) if self.fault != "random" else x % 4, zero, w, zero + 1, zero + 1)
+
+
+@pytest.mark.parametrize(("fault", "handling", "message"), [
+    ("random", {}, "Drawn.sample gave other items for the same seed, episode and step"),
+    ("size", {}, "Drawn.sample gave an item of a size that is not in `sizes`"),
+    ("outside", {}, r"Drawn.sample gave an item outside the bin of \(5, 5\) cells"),
+    ("handling", {"grams": [100, 200], "max_load": [0, 0]}, r"without its `handling`; of_kind\(\) adds it"),
+])  # fmt: skip
+def test_items_that_a_resume_would_refuse_are_refused_at_the_start(fault, handling, message):
+    with pytest.raises(ValueError, match=f"items: .*{message}"):
+        PickPlaceEnv(Drawn(fault, **handling), handling=bool(handling))
+    PickPlaceEnv(Drawn("none"))
 
 
 @settings(max_examples=150, deadline=None)

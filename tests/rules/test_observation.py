@@ -1,5 +1,7 @@
 """Observation terms: one of the user's own reaches TorchRL's specs, Gymnasium's space and search alike."""
 
+import re
+
 import gymnasium
 import pytest
 import torch
@@ -58,6 +60,17 @@ def test_a_term_of_ones_own_in_gymnasium():
     assert vector.observation_space.contains(observation) and observation["middle"].tolist() == [5, 5]
 
 
+@pytest.mark.parametrize(("bounds", "expected"), [
+    (Bounds(0, 9, (), torch.int64), "torch.int64 of shape (2,)"),
+    (Bounds(0, 9, (1,)), "torch.float32 of shape (2, 1)"),
+])  # fmt: skip
+def test_a_value_that_its_bounds_do_not_describe_is_refused(bounds, expected, monkeypatch):
+    monkeypatch.setattr(Middle, "bounds", lambda *_: bounds)
+    message = f"observation.middle: its value is torch.float32 of shape (2,), expected {expected}, as its bounds say."
+    with pytest.raises(ValueError, match=re.escape(message)):
+        PickPlaceEnv(observation=OWN, num_envs=2).reset()
+
+
 @given(problems(count=3))
 def test_the_state_can_be_read_from_an_observation(problem):
     cell, cases = problem
@@ -71,8 +84,14 @@ def test_the_state_can_be_read_from_an_observation(problem):
     ("terms", "message"),
     [
         ({**OWN, "middle": 3}, "observation.middle=3: expected a Term, such as"),
-        ({**OWN, "two words": Middle()}, "observation.two words: expected another name; taken are action,"),
-        *(({**OWN, key: Middle()}, f"observation.{key}: expected another name") for key in RESERVED),
+        (
+            {**OWN, "two words": Middle()},
+            "observation.two words: expected another name; taken are .",
+        ),
+        *(
+            ({**OWN, key: Middle()}, f"observation.{key}: expected another name")
+            for key in (*RESERVED, "action_mask", "edge_mask", "items", "handling", "level", "coming")
+        ),
         ({**STANDARD_TERMS, "tote_depth": Middle()}, "observation.tote_depth=Middle: expected ToteDepth"),
     ],
 )

@@ -3,8 +3,10 @@
 import json
 import logging
 import shutil
+from fractions import Fraction
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from commands import after_batch, assert_same
@@ -129,6 +131,37 @@ def test_validations_on_other_episodes_are_not_compared(smoke, tmp_path, monkeyp
 def test_a_training_that_spends_its_budget_does_not_end_early(smoke, tmp_path, no_report):
     smoke(tmp_path, words(last=2), "total_frames=256")
     assert checkpoint.read(tmp_path / "checkpoints" / "last")[1]["ended"] == ""
+
+
+class Hook(Callback):
+    """Calls a function at each batch."""
+
+    def __init__(self, function):
+        self.on_batch = {"numbers": self.numbers, "fail": self.fail}[function]
+
+    def numbers(self, trainer, metrics):
+        metrics |= {"train/solved": True, "train/half": Fraction(1, 2), "train/third": np.float32(0.25)}
+        metrics["eval/occupancy"] = 0.125  # a name of validations, between two of them
+
+    def fail(self, trainer, metrics):
+        [][3]
+
+
+def hook(function):
+    return f"+callbacks.mine={{_target_: test_callbacks.Hook, function: {function}}}"
+
+
+def test_whatever_counts_as_a_number_is_logged_as_one(smoke, tmp_path, no_report):
+    smoke(tmp_path, hook("numbers"), "total_frames=512", "evaluation_interval=512")
+    rows = read_csv(tmp_path / "metrics.csv")
+    assert [(row["train/solved"], row["train/half"], row["train/third"]) for row in rows] == [(1, 0.5, 0.25)] * 4
+    assert [row["eval/occupancy"] for row in rows[:3]] == [0.125] * 3 != rows[3]["eval/occupancy"]
+    resume_run([f"resume={tmp_path}", "trust=test_callbacks", "total_frames=640"])
+
+
+def test_a_callback_that_fails_is_named(smoke, tmp_path):
+    with pytest.raises(ValueError, match="^callbacks.mine.on_batch failed: IndexError: list index out of range"):
+        smoke(tmp_path, hook("fail"))
 
 
 class Trainer:

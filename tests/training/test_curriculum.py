@@ -206,6 +206,12 @@ class Weighted(NoAdvance):
         return self.given
 
 
+class Forgetful(Own):
+    def update(self, tally):
+        self.seen = None
+        return super().update(tally)
+
+
 class Misspelt(Own):
     state_keys = ("sean",)
 
@@ -245,6 +251,7 @@ ERRORS = [
     (lambda: play(make(Own(1, logs={"mood": "good"})), 10), "Own: it logs mood='good': expected a number"),
     (lambda: make(Own(1, torch.tensor(1))), r"Own: its state has seen=tensor\(1\): expected what JSON holds"),
     (lambda: make(Own(1, float("nan"))), "Own: its state has seen=nan"),
+    (lambda: play(make(Forgetful(1)), 10), "Forgetful: its state has seen=None: expected a number, as at the start"),
     (lambda: make(Misspelt(1)), "Misspelt: state_keys='sean': expected the name of an attribute"),
     (lambda: play(make(Own(1, logs=None)), 10), r"Own: its update=\(1, None\): expected \(level, "),
     *(

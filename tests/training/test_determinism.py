@@ -1,8 +1,12 @@
 """The promises of docs/determinism.md that no other test keeps."""
 
+import shutil
+
+import pytest
 import torch
-from commands import assert_same
+from commands import after_batch, assert_same, evaluated
 from omegaconf import OmegaConf
+from torch import nn
 
 from pickplace import PickPlaceEnv, Planner, Scene
 from pickplace.config.allowlist import trusted_config
@@ -10,10 +14,12 @@ from pickplace.evaluation.play import RESULTS, play
 from pickplace.planners.heuristics import RandomFeasible
 from pickplace.planners.lookahead import Lookahead
 from pickplace.planners.policy import PolicyPlanner
+from pickplace.policies.base import MASKED, ActionPolicy
 from pickplace.policies.restore import restore_policy
 from pickplace.runs import checkpoint
 from pickplace.runs.locate import locate
 from pickplace.runs.loggers import read_csv
+from pickplace.training.train import resume_run
 
 
 def test_the_same_training_twice(smoke, tmp_path, no_report):
@@ -43,6 +49,57 @@ def test_the_number_of_validations_changes_nothing_that_is_trained(smoke, tmp_pa
         trained[name] = {key: value.tolist() for key, value in tensors.items()}, metrics
         assert sum("eval/occupancy" in row for row in rows) == {"often": 20, "once": 1}[name]
     assert trained["often"] == trained["once"]
+
+
+class Noisy(ActionPolicy):
+    """Scores with dropout, and with a mean of all that it saw in training."""
+
+    def __init__(self, cell, mask_infeasible, rate=0.5):
+        super().__init__(cell, mask_infeasible)
+        self.network = nn.Sequential(nn.Linear(cell.num_places, cell.num_actions), nn.Dropout(rate))
+        self.frozen = nn.Dropout().eval()
+        self.register_buffer("mean", torch.zeros(cell.num_places))
+        self.register_buffer("calls", torch.tensor(0))
+
+    def action_scores(self, observation, mask=None):
+        depth = observation["tote_depth"].flatten(1)
+        if self.training:
+            self.calls += 1
+            self.mean += (depth.mean(0) - self.mean) / self.calls
+        scores = self.network(depth - self.mean)
+        return scores if mask is None else torch.where(mask, scores, MASKED)
+
+
+NOISY = [
+    "~model.actor", "+model.actor={_target_: test_determinism.Noisy}", "~model.critic",
+    "+model.critic={_target_: pooled, filters: 8, hidden: 8}", "total_frames=512", "checkpoint_interval=128",
+]  # fmt: skip
+
+
+def test_a_policy_with_dropout_and_running_means_resumes_exactly(smoke, tmp_path, no_report):
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    with after_batch(2, lambda _: shutil.copytree(whole, killed)):
+        smoke(whole, *NOISY)
+    resume_run([f"resume={killed}", "trust=test_determinism"])
+    assert_same(whole, killed)
+
+
+def test_a_validation_plays_what_an_evaluation_plays(smoke, tmp_path, no_report):
+    """Without dropout, and without learning means of what it sees. What the policy itself has frozen stays so."""
+    found = []
+
+    def validate(trainer):
+        calls = int(trainer.policy.calls)
+        found.extend(trainer.validate().occupancy.tolist() for _ in range(2))
+        assert calls == int(trainer.policy.calls) and trainer.policy.network.training
+        assert not trainer.policy.frozen.training
+
+    with after_batch(4, validate):
+        smoke(tmp_path / "run", *NOISY)
+    given = ["evaluation.stream=validation", "evaluation.episodes=8", "threads=1", "trust=test_determinism"]
+    last = f"checkpoint={tmp_path}/run/checkpoints/last"
+    played = evaluated(tmp_path / "played", last, *given)["occupancy"]["per_episode"]
+    assert found[0] == found[1] == pytest.approx(played)
 
 
 def make_env(first, count):
