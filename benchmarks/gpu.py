@@ -26,7 +26,7 @@ from environment import Jumanji
 from hydra import compose, initialize_config_dir
 from tensordict import TensorDict
 
-from pickplace.common.graphs import Compile
+from pickplace.common.graphs import CompileSettings
 from pickplace.config.composition import conf_dir
 from pickplace.planners.heuristics import RandomFeasible
 from pickplace.training.trainer import Trainer, training_env
@@ -98,7 +98,7 @@ def made_trainer(device: str, compile: str, *words: str) -> Trainer:
     return Trainer(cfg, Path(tempfile.mkdtemp()))
 
 
-def measure_environment(problems: int, device: str, compile: Compile, steps: int = 30) -> dict:
+def measure_environment(problems: int, device: str, compile: CompileSettings, steps: int = 30) -> dict:
     """Return the time of a step with the resets that follow it, and the mask of all actions, for random actions."""
     trainer = made_trainer(device, "none", "experiment=quick", "curriculum=none", "env.num_envs=1")
     make = partial(trainer.build_training_env, masks=("action",), episode_stride=problems)
@@ -177,7 +177,10 @@ def main() -> None:
     name = torch.cuda.get_device_name() if device == "cuda" else "cpu"
     result: dict = {"device": name, "environment": {}, "trainings": {}, "mark": MARK}
     for problems in sizes.problems:
-        rows = {key: measure_environment(problems, device, Compile(cudagraphs=key == "recorded")) for key in COMPILED}
+        rows = {
+            key: measure_environment(problems, device, CompileSettings(cudagraphs=key == "recorded"))
+            for key in COMPILED
+        }
         peer = measure_peer(problems)
         result["environment"][problems] = rows | ({"jumanji": peer} if peer else {})
         sys.stderr.write(f"{problems} problems: {result['environment'][problems]}\n")

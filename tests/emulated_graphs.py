@@ -1,7 +1,7 @@
 """CUDA graphs emulated on a CPU, under the code of ``CudaGraphModule``.
 
 Capturing notes the ATen operations and undoes what they did. Replaying repeats them on the same tensors. So work that
-depends on Python, on a tensor that was replaced, or on results, differs from work that is not recorded.
+depends on Python, on a tensor that was replaced, or on results, differs from work that is not captured.
 """
 
 from contextlib import nullcontext
@@ -94,7 +94,7 @@ class EmulatedTorch:
 
 
 def emulate(monkeypatch) -> None:
-    """Let recorded work go through ``CudaGraphModule`` on the CPU, for a test."""
+    """Let captured work go through ``CudaGraphModule`` on the CPU, for a test."""
     emulated, make = EmulatedTorch(), graphs.CapturedWork._make_graph
     monkeypatch.setattr(cudagraphs, "torch", emulated)
     monkeypatch.setattr(graphs.torch.cuda, "set_device", lambda device: None)

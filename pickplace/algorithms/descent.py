@@ -77,9 +77,9 @@ class MinibatchDescent(Algorithm):
     def use_parameters(self, parameters: Iterable[torch.nn.Parameter]) -> None:
         """Make the optimizer of these parameters."""
         self.parameters = [*parameters]
-        device, recorded = self.parameters[0].device, self.task.compile.cudagraphs
-        rate = torch.tensor(self.lr, device=device) if recorded else self.lr  # a recorded step reads it from there
-        capturable = recorded and device.type == "cuda"
+        device, captured = self.parameters[0].device, self.task.compile.cudagraphs
+        rate = torch.tensor(self.lr, device=device) if captured else self.lr  # a captured step reads it from there
+        capturable = captured and device.type == "cuda"
         self.optimizer = torch.optim.Adam(self.parameters, lr=rate, eps=1e-5, fused=True, capturable=capturable)
 
     def descend(self, data: TensorDictBase, position: BatchPosition, objective: Objective) -> dict[str, float]:
@@ -89,7 +89,7 @@ class MinibatchDescent(Algorithm):
             Mean diagnostics and the learning rate, ``train/...``.
 
         Raises:
-            FloatingPointError: if the loss or its gradient is not finite; with recorded steps after the batch, when the
+            FloatingPointError: if the loss or its gradient is not finite; with captured steps after the batch, when the
                 weights are not finite either.
         """
         rate = self.learning_rate(position)
@@ -107,7 +107,7 @@ class MinibatchDescent(Algorithm):
                 history.append(step(data[index]))
         sums = {name: float(sum(each[name] for each in history)) for name in history[0]}
         losses = [sums[name] for name in sums if name.startswith(("loss_", "grad_norm"))]
-        if not all(map(math.isfinite, losses)):  # of recorded steps, which do not look
+        if not all(map(math.isfinite, losses)):  # of captured steps, which do not look
             self._refuse_infinite(history[-1], data)
         return {f"train/{name}": total / len(history) for name, total in sums.items()} | {"train/lr": rate}
 
@@ -144,24 +144,20 @@ class MinibatchDescent(Algorithm):
 
     def learning_rate(self, position: BatchPosition) -> float:
         """Return the learning rate of a batch. With ``lr_decay_start`` a new run reaches 0 in its last batch."""
-        falls = f" lr_decay_start={self.lr_decay_start} total_frames={position.total_frames}"
-        falls = "" if self.lr_decay_start is None else falls
+        begun, frames, _, total = position
+        falls = "" if self.lr_decay_start is None else f" lr_decay_start={self.lr_decay_start} total_frames={total}"
         before, now = self.schedule["settings"], f"lr={self.lr}{falls}"
         if before != now:
-            self.schedule = {"settings": now, "since": position.frames_before if before else 0}
+            self.schedule = {"settings": now, "since": begun if before else 0}
         if before and before != now:
-            start = position.frames_before + (self.lr_decay_start or 0) * (
-                position.total_frames - position.frames_before
-            )
-            until = f", and falls to 0 from {start:,.0f} to {position.total_frames:,} frames" * bool(falls)
-            log.info("%s frames: the learning rate is now %g%s", f"{position.frames_before:,}", self.lr, until)
+            start = begun + (self.lr_decay_start or 0) * (total - begun)
+            until = f", and falls to 0 from {start:,.0f} to {total:,} frames" * bool(falls)
+            log.info("%s frames: the learning rate is now %g%s", f"{begun:,}", self.lr, until)
         if self.lr_decay_start is None:
             return self.lr
         since = self.schedule["since"]
-        frames = (
-            position.frames_before if since else position.frames
-        )  # a run resumed with a new schedule learns in its last batch, too
-        left = (1 - (frames - since) / max(position.total_frames - since, 1)) / max(1 - self.lr_decay_start, 1e-9)
+        frames = begun if since else frames  # a run resumed with a new schedule learns in its last batch, too
+        left = (1 - (frames - since) / max(total - since, 1)) / max(1 - self.lr_decay_start, 1e-9)
         return self.lr * min(max(left, 0.0), 1.0)
 
     def state_dict(self) -> dict:

@@ -92,11 +92,9 @@ def write_output(text: str = "") -> None:
     """
     try:
         if sys.stdout is not None:
-            sys.stdout.write(text)
+            encoding = sys.stdout.encoding or "utf-8"  # a name in a file may have letters that the terminal has not
+            sys.stdout.write(text.encode(encoding, "backslashreplace").decode(encoding))
             sys.stdout.flush()
-    except UnicodeEncodeError as error:  # a name in a file, and a terminal that cannot show it
-        sys.stdout.write(text.encode(error.encoding, "backslashreplace").decode(error.encoding))
-        sys.stdout.flush()
     except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise OSError(error.errno, error.strerror, "standard output") from error

@@ -4,7 +4,7 @@ import csv
 import io
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -113,17 +113,49 @@ def replaced_file(path):
         OSError: naming ``path``, if it cannot be written, for example because the disk is full.
     """
     path = Path(path)
-    new = path.with_name(f".{path.stem}.new{path.suffix}")
-    with reword_errors(OSError, lambda error: OSError(error.errno, error.strerror or str(error), str(path))):
+    new = _beside(path)
+    with _naming(path):
         try:
             new.unlink(missing_ok=True)  # it may be a link
             yield new
-            with new.open("rb") as file:
-                os.fsync(file.fileno())
-            new.replace(path)
+            _put_in_place(new, path)
             sync_folder(path.parent)
         finally:
             new.unlink(missing_ok=True)
+
+
+def replace_files(folder: Path, texts: Iterable[tuple[str, str]]) -> None:
+    """Write files, given by name and text, as :func:`replaced_file` does. The old ones stay until all are written."""
+    written: list[tuple[Path, Path]] = []
+    try:
+        for name, text in texts:
+            new = _beside(path := folder / name)
+            written.append((new, path))
+            with _naming(path):
+                new.unlink(missing_ok=True)
+                new.write_text(text, encoding="utf-8")
+        for new, path in written:
+            with _naming(path):
+                _put_in_place(new, path)
+        sync_folder(folder)
+    finally:
+        for new, _ in written:
+            new.unlink(missing_ok=True)
+
+
+def _beside(path: Path) -> Path:
+    return path.with_name(f".{path.stem}.new{path.suffix}")
+
+
+def _naming(path: Path):
+    """Return a context in which an ``OSError`` names the path."""
+    return reword_errors(OSError, lambda error: OSError(error.errno, error.strerror or str(error), str(path)))
+
+
+def _put_in_place(new: Path, path: Path) -> None:
+    with new.open("rb") as file:
+        os.fsync(file.fileno())
+    new.replace(path)
 
 
 def sync_folder(folder) -> None:

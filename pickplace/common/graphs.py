@@ -18,7 +18,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from pickplace.common.capture import capturing
 from pickplace.common.validate import flag, one_of, or_null, refuse_if
 
-#: A function of tensors by name. All tensors of a recorded one are detached; its shapes are fixed.
+#: A function of tensors by name. All tensors of a captured one are detached; its shapes are fixed.
 Work = Callable[[dict[str, Tensor]], dict[str, Tensor]]
 
 #: Modes of ``torch.compile`` without graphs of its own.
@@ -32,7 +32,7 @@ class CompileSettings:
     Args:
         compile: whether the acting policy and the gradient step go through ``torch.compile``.
         compile_mode: its mode.
-        cudagraphs: whether a GPU records the environment's step, the acting policy and the gradient step as CUDA
+        cudagraphs: whether a GPU captures the environment's step, the acting policy and the gradient step as CUDA
             graphs. On a CPU the same code runs, with the same fixed shapes, but without graphs.
 
     Raises:
@@ -61,7 +61,7 @@ NO_COMPILE = CompileSettings()
 
 
 class CapturedWork:
-    """Work that a GPU records in its third call, and then repeats; calls with other shapes run as they are.
+    """Work that a GPU captures in its third call, and then repeats; calls with other shapes run as they are.
 
     The first call makes constants, and the second one checks the work. On a CPU all calls run as they are.
 
@@ -70,7 +70,7 @@ class CapturedWork:
         what: its name in errors.
 
     Raises:
-        ValueError: in the second call, if the work cannot be recorded because it reads results back.
+        ValueError: in the second call, if the work cannot be captured because it reads results back.
     """
 
     def __init__(self, work: Work, what: str):
@@ -102,7 +102,7 @@ class CapturedWork:
         torch.cuda.set_device(device)  # the graph's streams are there
         os.environ.setdefault("EXCLUDE_TD_FROM_PYTREE", "1")  # else CudaGraphModule warns that it sees to it
         logging.getLogger("tensordict").setLevel(logging.WARNING)  # it reports each graph
-        # The work runs twice with the same inputs when it is recorded, so it must not change their dict.
+        # The work runs twice with the same inputs when it is captured, so it must not change their dict.
         return CudaGraphModule(lambda inputs: self.work({**inputs}), warmup=3)
 
 

@@ -260,15 +260,15 @@ def own_values(cfg: DictConfig) -> DictConfig:
             before = hydra.compose(running.job.config_name, [*search, *others], return_hydra_config=True)
         except ConfigCompositionException:  # an option that depends on those of other groups
             continue
+        merged = _part_at(cfg, place)
+        if isinstance(choice.value(), list):  # of callbacks: those that are listed keep their values
+            cfg = cfg.copy()
+            OmegaConf.update(cfg, place, {key: merged[key] for key in own or ()}, merge=False, force_add=True)
+            continue
         group = choice.get_key_element().lstrip("+~")  # as Hydra lists it, such as planner@warm_start.teacher
-        if isinstance(choice.value(), list):  # Hydra lists no choice of several options
-            is_other = {*(_part_at(before, place) or ())} != {*own}
-        else:
-            is_other = str(before.hydra.runtime.choices.get(group)) != str(choice.value())
-        if is_other:
+        if str(before.hydra.runtime.choices.get(group)) != str(choice.value()):
             cfg = cfg.copy()
             if place in SHARED_GROUPS:
-                merged = _part_at(cfg, place)
                 plain = [key for key in own if not isinstance(own[key], dict) and not isinstance(merged[key], dict)]
                 own |= {key: merged[key] for key in plain if key != "_target_"}
             OmegaConf.update(cfg, place, own, merge=False, force_add=True)

@@ -13,7 +13,7 @@ GROUPS = {
     "benchmark": "the cell, the items and the episodes of a published benchmark",
     "callbacks": "what a training calls, such as early stopping; several as callbacks=[a,b]",
     "collector": "the processes that play the episodes of a training",
-    "compile": "whether the work of a training is compiled, or recorded on a GPU",
+    "compile": "whether the work of a training is compiled, or captured on a GPU",
     "curriculum": "from easy to hard: the levels of a training, such as tote heights",
     "curriculum/advance": "when the next level begins",
     "curriculum/sample": "the levels that are played, up to the current one",

@@ -6,6 +6,7 @@ from itertools import product
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from pickplace.common.capture import is_capturing
 from pickplace.common.validate import refuse_above, refuse_if
@@ -53,22 +54,33 @@ def check_samples(cell: CellSpec, items: ItemDistribution, stream: str) -> None:
     Raises:
         ValueError: if equal arguments give other items, or if an item has another size, place or handling than it may.
     """
+    items = getattr(items, "drawn", items)  # beside published sequences
     if type(items).__module__.partition(".")[0] == "pickplace":  # these have tests of their own
         return
     name, limits = f"items: {type(items).__name__}.sample", torch.tensor(cell.bin_size[:2])
-    address = torch.arange(16).repeat_interleave(4), torch.arange(4).repeat(16)
-    item, again = (items.sample(stream, torch.zeros(64, dtype=torch.int64), *address, cell.bin_size) for _ in range(2))
-    refuse_if(not item.table.equal(again.table), f"{name} gave other items for the same seed, episode and step.")
+    episode, step = torch.arange(16).repeat_interleave(4), torch.arange(4).repeat(16)
+    some = torch.arange(64).flip(0)[::3]
+    item, again = (
+        items.sample(stream, torch.zeros_like(rows), episode[rows], step[rows], cell.bin_size)
+        for rows in (torch.arange(64), some)
+    )
+    same = item.rows(some).table.equal(again.table)
+    refuse_if(not same, f"{name} gave other items for the same seed, episode and step, in another batch.")
     there = item.exists
-    sizes = (item.table[:, None, 2:5] == items.sizes).all(-1).any(1)
-    refuse_if(not (sizes | ~there).all(), f"{name} gave an item of a size that is not in `sizes`.")
+    found, known = item.table[:, 2:5], items.sizes
+    refuse_if(not _are_in(known, found)[there].all(), f"{name} gave an item of a size that is not in `sizes`.")
     corner, size = item.table[:, :2], item.table[:, 2:4]
     inside = ((corner >= 0) & (corner + size <= limits)).all(1)
-    refuse_if(not (inside | ~there).all(), f"{name} gave an item outside the bin of {cell.bin_size[:2]} cells.")
+    refuse_if(not inside[there].all(), f"{name} gave an item outside the bin of {cell.bin_size[:2]} cells.")
     if items.handling is not None:
-        handling = torch.stack([item.turns, item.grams, item.max_load], 1)
-        known = (handling[:, None] == items.handling).all(-1).any(1)
-        refuse_if(not (known | ~there).all(), f"{name} gave an item without its `handling`; of_kind() adds it.")
+        found = torch.cat([found, torch.stack([item.turns, item.grams, item.max_load], 1)], 1)
+        good = _are_in(torch.cat([known, items.handling], 1), found)
+        refuse_if(not good[there].all(), f"{name} gave an item without its `handling`; of_kind() adds it.")
+
+
+def _are_in(known: Tensor, rows: Tensor) -> Tensor:
+    """Return whether each row, int64 ``[N, C]``, is one of the known ones ``[K, C]``, bool ``[N]``."""
+    return torch.stack([(known == row).all(1).any() for row in rows])
 
 
 def check_items(cell: CellSpec, items: ItemDistribution, mix: int = 0, turns: int = ALL_TURNS) -> None:

@@ -7,7 +7,7 @@ import json
 import math
 import re
 from collections.abc import Container
-from contextlib import ExitStack
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -77,7 +77,7 @@ def run(args: argparse.Namespace) -> None:
     length, width, height = map(int, match.groups() if match else ())
     container = length, width, height
     refuse_if(not min(container), f"--container={args.container}: expected sides of 1 mm or more.")
-    from pickplace.common.files import replaced_file
+    from pickplace.common.files import replace_files
     from pickplace.common.validate import one_of
     from pickplace.evaluation.pack import OrderPacker
     from pickplace.items.order_file import MILLIMETRES, read_orders
@@ -113,16 +113,13 @@ def run(args: argparse.Namespace) -> None:
     writer.writeheader()
     writer.writerows(rows)
     files = [f"replay_{number}.html" for number in range(1, len(orders) + 1)] if len(orders) > 1 else ["replay.html"]
-    with ExitStack() as replaced:  # the old files stay until all new ones are written
-        for name, text in (
-            ("plan.csv", columns.getvalue()), ("plan.json", json.dumps(bed_bpp, indent=1) + "\n"),
-            (PLANS, to_lines(plans)), *((file, page(*each)) for file, each in zip(files, recorded, strict=True)),
-        ):  # fmt: skip
-            replaced.enter_context(replaced_file(folder / name)).write_text(text, encoding="utf-8")
+    pages = ((file, page(*each)) for file, each in zip(files, recorded, strict=True))
+    texts = [("plan.csv", columns.getvalue()), ("plan.json", json.dumps(bed_bpp, indent=1) + "\n")]
+    replace_files(folder, chain(texts, [(PLANS, to_lines(plans))], pages))
     for old in [path for path in earlier if path.name not in files]:
         old.unlink()
-    pages = " to ".join(dict.fromkeys((files[0], files[-1])))
-    write_output(f"{folder}: plan.csv, plan.json, {PLANS}, {pages}\n")
+    shown = " to ".join(dict.fromkeys((files[0], files[-1])))
+    write_output(f"{folder}: plan.csv, plan.json, {PLANS}, {shown}\n")
 
 
 def _free_names(name: str, count: int, taken: Container[str]) -> tuple[str, list[str]]:

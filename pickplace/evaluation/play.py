@@ -211,10 +211,13 @@ def play(
 
 @contextmanager
 def evaluation_mode(*modules: nn.Module) -> Iterator[None]:
-    """Within this context, modules are as in ``pickplace-evaluate``: dropout and batch statistics are not used."""
+    """Within this context, dropout and batch statistics are not used, as in ``pickplace-evaluate``.
+
+    A module with a true attribute ``validates_as_trained`` stays in training mode.
+    """
     parts = {part: part.training for module in modules for part in module.modules()}
-    for module in modules:
-        module.eval()
+    for part in parts:
+        part.training = getattr(part, "validates_as_trained", False)
     try:
         yield
     finally:

@@ -244,7 +244,7 @@ def _rows_of_json(path: Path, text: str) -> Iterator[_Row]:
         for number in sorted(items, key=int):
             if not isinstance(items[number], dict):
                 raise wrong(f"order {excerpt(name)}, item {number} is {excerpt(items[number])}")
-            own = {key: value for key, value in items[number].items() if str(key).lower() not in NAMES["order"]}
+            own = {key: value for key, value in items[number].items() if _name_and_unit(key)[0] not in NAMES["order"]}
             place, entries = f"order {_printable(name)}, item {number}", {**about, **own, "order": name}
             yield _Row(place, tuple(entries), tuple(entries.values()), place)
 
@@ -252,17 +252,15 @@ def _rows_of_json(path: Path, text: str) -> Iterator[_Row]:
 def _read_header(place: str, header: Sequence, unit: str, decimal: str) -> dict[str, _Column]:
     """Return the columns that a header names, by the names of :data:`NAMES`."""
     found: dict[str, tuple[str, str | None]] = {}
+    similar: dict[str, str] = {}  # name of an optional column -> a name in the file that begins with it
     for key in header:
-        match = COLUMN.fullmatch(" ".join(str(key).lower().split()))
-        assert match  # it matches any text
-        name, suffix = match[1].replace(" ", "_").replace("-", "_"), match[2]
+        name, suffix = _name_and_unit(key)
         known = name in {each for names in NAMES.values() for each in names}
         refuse_if(known and name in found, f"{place}: two columns {excerpt(name)}; expected one.")
         words = re.sub(r"[^a-z0-9]+", "_", name).strip("_") + "_"
-        meant = [column for column in OPTIONAL if any(words.startswith(f"{each}_") for each in NAMES[column])]
-        if meant and not known:
-            in_units = " in g or kg" if meant[0] in UNITS else ""
-            raise ValueError(f"{place}: the column {excerpt(key)} is not known; expected {meant[0]}{in_units}.")
+        for column in OPTIONAL if not known else ():
+            if any(words.startswith(f"{each}_") for each in NAMES[column]):
+                similar[column] = key
         found[name] = key, suffix
     # In l,w,h and length,width,height the width is the second side; in w,d,h and width,depth,height the first.
     is_second = {"length", "l"} & {*found} or not {"d", "depth"} & {*found}
@@ -281,12 +279,25 @@ def _read_header(place: str, header: Sequence, unit: str, decimal: str) -> dict[
                 f"{place}: the column {excerpt(key)} is in {value}; expected {' or '.join(map(str, units))}.",
             )
             columns[column] = _Column(key, units[value], decimal)
+    for column, key in similar.items():
+        in_units = " in g or kg" if column in UNITS else ""
+        refuse_if(
+            column not in columns,
+            f"{place}: the column {excerpt(key)} is not known; expected {column}{in_units}.",
+        )
     missing = [name for name in (*SIDES, "weight") if name not in columns]
     refuse_if(
         missing,
         f"{place}: no column {' and no '.join(missing)} in {excerpt(','.join(map(str, header)))}; expected {EXPECTED}.",
     )
     return columns
+
+
+def _name_and_unit(key) -> tuple[str, str | None]:
+    """Return the name of a column, in small letters with underscores, and its unit, if any."""
+    match = COLUMN.fullmatch(" ".join(str(key).lower().split()))
+    assert match  # it matches any text
+    return match[1].replace(" ", "_").replace("-", "_"), match[2]
 
 
 def _printable(name: str) -> str:
@@ -312,8 +323,8 @@ def _read_row(place: str, row: Mapping, columns: dict[str, _Column]) -> tuple[Or
     def read(name: str, most: float) -> float:
         key, unit, _ = columns[name]
         with suppress(TypeError, ValueError, OverflowError):
-            if 0 < (number := columns[name].number(row)) * unit <= most:
-                return round(number * unit, 6)
+            if 0 < (number := round(columns[name].number(row) * unit, 6)) <= most:
+                return number
         expected = f"{columns[name].expected(row)} above 0, at most {most / unit:,.10g}"
         raise ValueError(f"{place}: {key}={excerpt(row[key])}: expected {expected}.")
 

@@ -61,9 +61,9 @@ class Orders(ItemDistribution):
         self._examples: list[OrderItem] = []  # of each kind
         numbered = [[self._number(item, kinds) for item in order.items] for order in orders]
         distinct = list(dict.fromkeys(map(tuple, numbered)))
-        alike: dict[tuple, list[tuple[int, ...]]] = {}  # orders of the same sizes in cells, in any sequence
+        alike: dict[tuple, list[tuple[int, ...]]] = {}  # orders with the same sizes, in any sequence
         for order in distinct:
-            alike.setdefault(tuple(sorted(self.cells(self._examples[kind]) for kind in order)), []).append(order)
+            alike.setdefault(tuple(sorted(self._examples[kind][1:4] for kind in order)), []).append(order)
         refuse_if(
             flag("items.split", split) and len(alike) < 3,
             f"items.path={str(path)!r}: the file has {len(alike)} orders of different sizes; expected three at least, "

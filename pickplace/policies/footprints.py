@@ -31,8 +31,8 @@ from pickplace.rules.step import apply
 
 #: Formula of an index of the scores of all footprints.
 FOOTPRINT_INDEX = (
-    "(quarter_turned * W_T + x) * D_T + y: first cell of the item in the tote; quarter_turned 1: turned by 90 degrees; "
-    "of several items one after the other"
+    "(quarter_turned * W_T + x) * D_T + y: first cell of the item in the tote; quarter_turned is 1 if turned by 90 "
+    "degrees; of several items one after the other"
 )
 
 
@@ -100,9 +100,8 @@ class FootprintScorer(Policy):
         bins, totes, bearing = (observation[key] for key in MAP_KEYS)
         places = self.cell.footprint_turns * totes.shape[1] * totes.shape[2]
         contents = ScoredItems(items_from_observation(observation), footprint // places)
-        return self.network.footprint_scores(bins, totes, bearing, row, footprint - contents.number * places, contents)[
-            :, 0
-        ]
+        own = footprint - contents.number * places
+        return self.network.footprint_scores(bins, totes, bearing, row, own, contents)[:, 0]
 
     def footprint_logits(self, observation: Observation, mask: Tensor) -> Tensor:
         """Return logits of footprints, computed only where a mask ``[N, M * Q * W_T * D_T]`` allows them; else

@@ -181,7 +181,7 @@ def load_policy(path, device: str = "cpu", trust: Sequence[str] = (), **sizes) -
     given = env.get("observation") or {}
     expect(isinstance(given, dict), "env.observation", given, "terms by their keys")
     terms = {str(key): build(f"env.observation.{key}", node) for key, node in given.items()}
-    return TrainedPolicy(policy, check_terms(terms), cfg)
+    return TrainedPolicy(policy, check_terms(terms, policy.cell), cfg)
 
 
 def load_critic(path, trained: TrainedPolicy) -> "RestoredCritic | None":

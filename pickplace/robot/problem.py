@@ -99,7 +99,7 @@ class Problem(ABC):
         number = self.taken_items(action)
         item = select_item(self.state.items, number)
         _, rotation, _, (x, y, *_) = carry(self.cell, item, action)
-        quarter_turned = rotation % 2 * (item.w != item.d)  # masks have a square footprint under quarter_turned 0
+        quarter_turned = rotation % 2 * (item.w != item.d)  # masks list a square footprint as not turned
         return number * self.cell.num_footprints + footprint_index(self.cell.tote_size, quarter_turned, x, y)
 
     @property

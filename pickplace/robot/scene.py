@@ -139,8 +139,8 @@ class Scene:
             EmptyBinError: if the bin is seen, and nothing lies in it.
             DepthMapError: for an image that allows no plan; another image may do.
         """
-        (over_bin, bin_image), (effector_over_tote, tote_image) = bin_view, tote_view
-        pixel, clearance = max(over_bin.pixel(), effector_over_tote.pixel()), settings.get("clearance", CLEARANCE)
+        (over_bin, bin_image), (over_tote, tote_image) = bin_view, tote_view
+        pixel, clearance = max(over_bin.pixel(), over_tote.pixel()), settings.get("clearance", CLEARANCE)
         number("clearance", clearance, 0, 0.1, "metres")
         refuse_if(
             clearance < CLEARANCE_PIXELS * pixel - 1e-9,
@@ -150,7 +150,7 @@ class Scene:
         greatest = tote_height if greatest_height is None else greatest_height
         return cls(
             over_bin.items(bin_image, cell, cell_size, labels, accuracy, sizes, greatest, bin_height),
-            effector_over_tote.tote_map(tote_image, cell, cell_size, tote_height, accuracy, placed),
+            over_tote.tote_map(tote_image, cell, cell_size, tote_height, accuracy, placed),
             cell_size, accuracy, tote_height=tote_height, bin_height=bin_height, placed=placed, **settings,
         )  # fmt: skip
 

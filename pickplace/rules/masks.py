@@ -1,8 +1,9 @@
 """Masks: which actions succeed, and which footprints some action reaches.
 
-Symbols used in shapes: ``N`` problems, ``P`` pick cells, ``R`` rotations, ``Q`` quarter turns of a footprint, ``K``
-offsets of the item under the end effector, ``T`` turns and ``T * K`` grasp classes (see :mod:`pickplace.rules.grasps`),
-``B`` distinct shapes of the turned end effector (see :attr:`pickplace.rules.cell.CellSpec.effectors`).
+Symbols used in shapes: ``N`` problems, ``P`` pick cells, ``R`` rotations, ``Q`` ways to turn a footprint (by 0 and 90
+degrees), ``K`` offsets of the item under the end effector, ``T`` turns and ``T * K`` grasp classes (see
+:mod:`pickplace.rules.grasps`), ``B`` distinct shapes of the turned end effector (see
+:attr:`pickplace.rules.cell.CellSpec.effectors`).
 
 Two properties make the check of all ``N_a = P * W_T * D_T * R`` actions cheap. The bin matters only through the grasp
 class. And the end effector collides if and only if something under it is higher than the item's top, where the rim is a

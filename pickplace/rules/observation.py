@@ -245,7 +245,9 @@ HANDLING_TERMS: Mapping[str, Term] = {
 }
 
 #: Entries that only some cells have. From their presence the rules know the cell.
-OPTIONAL_TERMS = ("bin_labels", "items", "coming", *HANDLING_TERMS, *EPISODE_TERMS)
+OPTIONAL_TERMS: Mapping[str, Term] = {
+    "bin_labels": BinLabels(), "items": Items(), "coming": Coming(), **HANDLING_TERMS, **EPISODE_TERMS,
+}  # fmt: skip
 
 #: Keys of the environment, the policies and the learner that no term may have.
 RESERVED = (
@@ -290,10 +292,11 @@ def check_terms(terms: Mapping[str, Term] | None, cell: CellSpec = PAPER_CELL) -
     for key, term in given.items():
         place = f"observation.{short_text(key)}"
         expect(isinstance(term, Term), place, term, "a Term, such as pickplace.rules.observation.ToteDepth")
-        taken = {*RESERVED, *OPTIONAL_TERMS} - standard.keys()
+        other = [name for name, each in OPTIONAL_TERMS.items() if name not in standard and type(term) is not type(each)]
+        taken = [*RESERVED, *other]
         refuse_if(
             not isinstance(key, str) or key in taken or key.endswith("_mask") or not key.isidentifier(),
-            f"{place}: expected another name; taken are *_mask, {', '.join(sorted(taken))}.",
+            f"{place}: expected another name; taken are *_mask, {', '.join(taken)}.",
         )
     found = {**standard, **given}
     for key, term in standard.items():

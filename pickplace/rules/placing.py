@@ -62,7 +62,7 @@ def unchecked_top(
 
 
 def footprint_sizes(cell: CellSpec, item: Item) -> tuple[Tensor, Tensor]:
-    """Return width and depth of the item's footprint in each quarter_turned, int64 ``[Q, 1, 1, N]`` each."""
+    """Return width and depth of the item's footprint not turned and turned, int64 ``[Q, 1, 1, N]`` each."""
     sides = torch.stack([item.w, item.d])[:, None, None]
     return sides[: cell.footprint_turns], sides.flip(0)[: cell.footprint_turns]
 

@@ -4,7 +4,7 @@ import json
 from typing import Any
 
 from pickplace.common.errors import sentence
-from pickplace.common.validate import expect, number, or_null, refuse_if, reword_errors, whole_number
+from pickplace.common.validate import expect, number, or_null, refuse_if, whole_number
 from pickplace.config.registry import build
 from pickplace.evaluation.play import Episodes
 from pickplace.runs.loggers import check_metrics
@@ -139,11 +139,15 @@ def call(callbacks: dict[str, Callback], hook: str, trainer: Any, *arguments: An
     metrics = arguments[-1] if isinstance(arguments[-1], dict) else {}
     for name, callback in callbacks.items():
         before, where = dict(metrics), f"callbacks.{name}.{hook}"
-        with reword_errors(Exception, lambda error: ValueError(f"{where} failed: {sentence(error)}")):  # noqa: B023
+        try:
             getattr(callback, hook)(trainer, *arguments)
+        except (ArithmeticError, AssertionError, AttributeError, LookupError, NameError, TypeError) as error:
+            raise ValueError(f"{where} failed: {sentence(error)}") from error
         for key in before:
             refuse_if(
                 key not in metrics, f"callbacks.{name}: it removes {key} from the metrics; expected changed values."
             )
         changed = {key: value for key, value in metrics.items() if key not in before or value is not before[key]}
+        early = [key for key in changed if key.startswith("eval/") and hook != "on_validation"]
+        refuse_if(early, f"{where}: it logs {', '.join(early)}; expected another name, eval/... is of validations.")
         check_metrics(f"callbacks.{name}", changed)

@@ -35,11 +35,11 @@ class CompiledPolicy(TensorDictModuleBase):
 
 
 class CapturedEnv(TransformedEnv):
-    """A training environment whose step, with the resets that follow it, is one recorded piece of work.
+    """A training environment whose step, with the resets that follow it, is one captured piece of work.
 
     It returns the same as TorchRL's ``step_and_maybe_reset``. The levels of new episodes are drawn on the CPU in every
-    step, because the recorded work cannot say whether an episode has ended. Its state must not be loaded after a step:
-    recorded work keeps the addresses of the masks.
+    step, because the captured work cannot say whether an episode has ended. Its state must not be loaded after a step:
+    captured work keeps the addresses of the masks.
 
     Args:
         env: the environment.
@@ -53,7 +53,7 @@ class CapturedEnv(TransformedEnv):
 
     def reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
         state = super().reset(tensordict, **kwargs)
-        # Copies: recorded work writes into the environment's own masks.
+        # Copies: captured work writes into the environment's own masks.
         return state.update({key: value.clone() for key, value in state.items() if key.endswith("_mask")})
 
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:

@@ -294,7 +294,7 @@ class Trainer:
         cfg, frames = self.cfg, self.frames
         callbacks.call(self.callbacks, "on_batch", self, metrics)
         interval = cfg.evaluation_interval or -(-cfg.total_frames // VALIDATIONS)
-        if validates := self.is_complete or has_passed(before, frames, interval):
+        if self.is_complete or has_passed(before, frames, interval):
             self.episodes = self.validate()
             self.latest = validation_metrics(self.episodes)
             metrics |= {f"eval/{key}": value for key, value in self.latest.items()}
@@ -303,7 +303,7 @@ class Trainer:
         # Whatever counts as a number, such as true or a numpy float, is written as one.
         self.logger.log({key: each if type(each) is int else float(each) for key, each in metrics.items()}, frames)
         # After the row was logged: a run that is resumed from this checkpoint needs it.
-        if validates and self.latest["occupancy"] > self.best:
+        if "eval/occupancy" in metrics and self.latest["occupancy"] > self.best:
             self.best = self.latest["occupancy"]
             self.save("best")
         if has_passed(before, frames, cfg.checkpoint_interval):

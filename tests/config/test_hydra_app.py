@@ -177,6 +177,8 @@ OWN_VALUES = [
     ("experiment=wide callbacks=[early_stopping]", {"callbacks.early_stopping.patience": 5}),
     ("experiment=wide callbacks=[second]", {"callbacks": {"second": {"_target_": "early_stopping", "patience": 2}}}),
     ("experiment=wide callbacks=[second] callbacks.second.patience=7", {"callbacks.second.patience": 7}),
+    ("experiment=wide callbacks=[second,early_stopping]", {"callbacks.early_stopping.patience": 5}),
+    ("experiment=wide callbacks=[]", {"callbacks": {}}),
     ("curriculum=careful curriculum.sample.share='${..advance.occupancy}'", {"curriculum.sample.share": 0.85}),
     ("experiment=mine curriculum/advance=plateau", {"curriculum.advance": PLATEAU}),
     ("experiment=mine curriculum=paper", {"curriculum.advance": {"_target_": "frames", "frames_per_level": 5_000_000}}),

@@ -21,11 +21,12 @@ class Drawn(Kinds):
         self.calls += 1
         zero = torch.zeros_like(episode)
         w = zero + {"size": 3}.get(self.fault, 2)
-        x = (episode + step) % 4 + (self.fault == "outside") + (self.calls if self.fault == "random" else 0)
-        return Item(x.clamp(max=4) if self.fault != "random" else x % 4, zero, w, zero + 1, zero + 1)
+        more = {"random": self.calls, "batch": len(step), "outside": 1}.get(self.fault, 0)
+        return Item((episode + step + more) % 4 + (self.fault == "outside"), zero, w, zero + 1, zero + 1)
 
 
 @pytest.mark.parametrize(("fault", "handling", "message"), [
+    ("batch", {}, "Drawn.sample gave other items for the same seed, episode and step"),
     ("random", {}, "Drawn.sample gave other items for the same seed, episode and step"),
     ("size", {}, "Drawn.sample gave an item of a size that is not in `sizes`"),
     ("outside", {}, r"Drawn.sample gave an item outside the bin of \(5, 5\) cells"),

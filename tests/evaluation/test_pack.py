@@ -215,7 +215,7 @@ def test_tiny_items_and_orders_of_one_name_end(pack, tmp_path):
     """Orders keep apart, with one name in both files: those that differ by a control character, or clash with another
     one's second container."""
     (path := tmp_path / "a.csv").write_text(
-        "order,l,w,h,kg\n7,300,200,200,1\n7,300,200,200,1\n7#2,60,50,20,1\n8,1e-7,50,20,1e-9\n8\x1b[31m,50,50,50,1\n"
+        "order,l,w,h,kg\n7,300,200,200,1\n7,300,200,200,1\n7#2,60,50,20,1\n8,1e-6,50,20,1e-9\n8\x1b[31m,50,50,50,1\n"
         "8\x1c[31m,50,50,50,1\na,50,50,50,1\n"
     )
     folder, out = pack(path, "--container", "300x200x200")

@@ -385,7 +385,7 @@ def outcome(planner: Planner, cell: str, views, **settings) -> tuple[str, object
     return plan.status, plan
 
 
-def evaluate_choices(planners: dict, seed: int, kinds=KINDS) -> tuple[str, str, str | None, object]:
+def judge(planners: dict, seed: int, kinds=KINDS) -> tuple[str, str, str | None, object]:
     """Kind of a scene, the outcome, what is wrong, and for a good scene whether its clean images have a plan."""
     draw = np.random.default_rng(seed)
     cell, kind = str(draw.choice(list(CELLS))), str(draw.choice(kinds))
@@ -410,7 +410,7 @@ def run(seeds, kinds=KINDS, report=lambda _: None) -> tuple[Counter, list[str], 
     """Counts of ``(kind, status)``, the false plans, and the counts of good scenes with a plan by their outcome."""
     planners, counts, false, good = make_planners(), Counter(), [], Counter()
     for seed in seeds:
-        kind, status, wrong_with, (is_feasible, result) = evaluate_choices(planners, seed, kinds)
+        kind, status, wrong_with, (is_feasible, result) = judge(planners, seed, kinds)
         counts[kind, status] += 1
         if wrong_with:
             false.append(f"seed {seed}, {kind}: {wrong_with}")

@@ -119,8 +119,8 @@ def test_it_sees_what_a_person_would_read_off_the_maps(seed, field, tote, sizes,
 def test_only_what_the_mask_allows_is_computed_and_it_is_the_same(rotations, monkeypatch):
     env, state = late_state(tote_size=(7, 5, 3), rotations=rotations, masks=("action", "footprint"))
     policy, mask = FcnGrasp(env.cell, **FLOAT), state["footprint_mask"]
-    asked, at = [], policy.network.at
-    monkeypatch.setattr(policy.network, "at", lambda *args: asked.append(len(args[3])) or at(*args))
+    asked, at = [], policy.network.footprint_scores
+    monkeypatch.setattr(policy.network, "footprint_scores", lambda *args: asked.append(len(args[3])) or at(*args))
     logits = policy.logits(state)
     assert asked == [int(mask.sum())] and asked[0] < mask.numel()
     everywhere = every_score(policy.network, *(state[key] for key in MAP_KEYS), env.cell.footprint_turns).flatten(1)

@@ -154,11 +154,11 @@ def test_one_camera_sees_both():
     base_from_camera[:3, 3] = (0.3, 0.15, 1.4)
     bin_at, tote_at = np.array((0.0, 0.03)), np.array((0.33, 0.0))
     poses = [np.linalg.inv(frame(0, *at, 0)) @ base_from_camera for at in (bin_at, tote_at)]
-    over_bin, effector_over_tote = (Camera(380, 380, 159.5, 119.5, pose, SHAPE) for pose in poses)
+    over_bin, over_tote = (Camera(380, 380, 159.5, 119.5, pose, SHAPE) for pose in poses)
     # Both rooms in one image: the nearer surface counts where both draw one.
     item = box_of((0.1, 0.08, 0.06), 0.12, 0.13, 20)
-    both = np.minimum(image(over_bin, [item], BIN), image(effector_over_tote, []))
-    scene = Scene.from_images(CELL, (over_bin, both), (effector_over_tote, both), SIZE, clearance=0.0075)
+    both = np.minimum(image(over_bin, [item], BIN), image(over_tote, []))
+    scene = Scene.from_images(CELL, (over_bin, both), (over_tote, both), SIZE, clearance=0.0075)
     (box,) = scene.items
     assert (box.x, box.y, box.h) == pytest.approx((0.12, 0.13, 0.06), abs=0.003)
     assert DBL.plan(scene).status == "ok"

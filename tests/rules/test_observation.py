@@ -86,7 +86,7 @@ def test_the_state_can_be_read_from_an_observation(problem):
         ({**OWN, "middle": 3}, "observation.middle=3: expected a Term, such as"),
         (
             {**OWN, "two words": Middle()},
-            "observation.two words: expected another name; taken are .",
+            r"observation.two words: expected another name; taken are \*_mask, action, ",
         ),
         *(
             ({**OWN, key: Middle()}, f"observation.{key}: expected another name")

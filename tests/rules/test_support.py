@@ -64,7 +64,7 @@ def test_large_items_touch_what_small_ones_do(side, seed):
     w, d = (torch.randint(1, side + 1, (2, 1, 1, 5), generator=random) for _ in range(2))
     small, large = FootprintContact(cell, surface, w, d), LargeFootprintContact(cell, surface, w, d)
     inside = small.z < FAR
-    for quantity in ("count", "share", "corners"):
+    for quantity in ("count", "share", "num_supported_corners", "num_level_corners"):
         assert torch.equal(getattr(small, quantity)[inside], getattr(large, quantity)[inside]), quantity
     for name in RULES:
         assert torch.equal(RULES[name]().stable(small)[inside], RULES[name]().stable(large)[inside]), name

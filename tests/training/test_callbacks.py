@@ -137,11 +137,13 @@ class Hook(Callback):
     """Calls a function at each batch."""
 
     def __init__(self, function):
-        self.on_batch = {"numbers": self.numbers, "fail": self.fail}[function]
+        self.on_batch = {"numbers": self.numbers, "fail": self.fail, "early": self.early}[function]
 
     def numbers(self, trainer, metrics):
         metrics |= {"train/solved": True, "train/half": Fraction(1, 2), "train/third": np.float32(0.25)}
-        metrics["eval/occupancy"] = 0.125  # a name of validations, between two of them
+
+    def early(self, trainer, metrics):
+        metrics["eval/occupancy"] = 0.125
 
     def fail(self, trainer, metrics):
         [][3]
@@ -155,7 +157,6 @@ def test_whatever_counts_as_a_number_is_logged_as_one(smoke, tmp_path, no_report
     smoke(tmp_path, hook("numbers"), "total_frames=512", "evaluation_interval=512")
     rows = read_csv(tmp_path / "metrics.csv")
     assert [(row["train/solved"], row["train/half"], row["train/third"]) for row in rows] == [(1, 0.5, 0.25)] * 4
-    assert [row["eval/occupancy"] for row in rows[:3]] == [0.125] * 3 != rows[3]["eval/occupancy"]
     resume_run([f"resume={tmp_path}", "trust=test_callbacks", "total_frames=640"])
 
 
@@ -169,6 +170,11 @@ class Trainer:
 
     def end(self, reason):
         self.ended = reason
+
+
+def test_a_metric_of_validations_is_logged_by_validations_only(smoke, tmp_path):
+    with pytest.raises(ValueError, match="^callbacks.mine.on_batch: it logs eval/occupancy; expected another name"):
+        smoke(tmp_path, hook("early"))
 
 
 @pytest.mark.parametrize(

@@ -34,9 +34,8 @@ class PitPolicy(FcnGrasp):
     def __init__(self, cell, mask_infeasible: bool, **network):
         super().__init__(cell, mask_infeasible, **network)
         self.in_keys = [*self.in_keys, "pit_depth"]  # the key under which env/pits.yaml lists the term
-        self.pits = nn.Conv2d(
-            1, cell.footprint_turns, kernel_size=5, padding=2
-        )  # a score for each footprint's first cell
+        # A score for each footprint's first cell.
+        self.pits = nn.Conv2d(1, cell.footprint_turns, kernel_size=5, padding=2)
 
     def scores(self, observation, row, footprint):
         """Return the scores of footprints, float32 ``[M]``; ``row`` is the problem of each."""

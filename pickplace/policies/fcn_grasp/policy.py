@@ -65,7 +65,7 @@ class UnmaskedFcnGrasp(Policy):
         (tote_w, tote_d, _), offsets, low = self.cell.tote_size, self.cell.num_offsets, self.cell.min_offset
         step, x, y = torch.arange(offsets), torch.arange(tote_w), torch.arange(tote_d)
         channel, found = torch.arange(offsets**2).view(offsets, offsets, 1, 1), []
-        for turn in range(num_grasp_turns(self.cell)):  # turns of one quarter_turned have the same scores
+        for turn in range(num_grasp_turns(self.cell)):  # turns that differ by 180 degrees have the same scores
             quarter_turned, shape = turn % 2, self.cell.effector(turn)
             left = x[:, None] + (step[:, None, None, None] + low - shape.ref_x)  # [O, 1, W_T, 1]
             front = y + (step[:, None, None] + low - shape.ref_y)  # [O, 1, D_T]

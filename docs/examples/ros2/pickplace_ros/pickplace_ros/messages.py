@@ -100,7 +100,7 @@ def box_message(box: Box, bottom: float, view: View) -> msg.Box:
     )
 
 
-def plan_message(plan: Plan, over_bin: View, effector_over_tote: View, tote_cells: tuple[int, int]) -> msg.Plan:
+def plan_message(plan: Plan, over_bin: View, over_tote: View, tote_cells: tuple[int, int]) -> msg.Plan:
     """Return the message of a plan from two views, for a tote of so many cells along x and y.
 
     It has all of the plan but ``item``, the whole cells that the policy sees, and ``alternatives``.
@@ -121,8 +121,8 @@ def plan_message(plan: Plan, over_bin: View, effector_over_tote: View, tote_cell
         message.box = box_message(plan.box, 0.0, over_bin)
     if plan.status == msg.Plan.OK:
         message.pick = stamped(plan.pick.center, plan.pick.yaw, over_bin)
-        message.place = stamped(plan.place.center, plan.place.yaw, effector_over_tote)
+        message.place = stamped(plan.place.center, plan.place.yaw, over_tote)
         message.rotation = math.radians(plan.rotation_degrees)
         message.drop_height = float(plan.drop_height)
-        message.placed = box_message(plan.placed, plan.drop_height, effector_over_tote)
+        message.placed = box_message(plan.placed, plan.drop_height, over_tote)
     return message

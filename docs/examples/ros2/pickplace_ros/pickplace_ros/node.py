@@ -212,12 +212,12 @@ class PickPlaceNode(Node):
             message = f"tf: no transform to {frame!r} from {header.frame_id!r} at the image's time: {error}"
             raise NotReady(message) from error
 
-    def plan(self, over_bin: View, effector_over_tote: View) -> Plan:
+    def plan(self, over_bin: View, over_tote: View) -> Plan:
         """Plan from two views and from what was done before."""
         keys = ("accuracy", "bin_height", "tote_height", "greatest_height", "clearance", "placement_error")
         settings = {key: self.settings[key] for key in keys}
         scene = Scene.from_images(
-            self.planner.cell, (over_bin.camera, over_bin.depth), (effector_over_tote.camera, effector_over_tote.depth),
+            self.planner.cell, (over_bin.camera, over_bin.depth), (over_tote.camera, over_tote.depth),
             self.settings["cell_size"], tote_bearing=self.record.bearing, placed=self.record.placed_boxes, **settings,
         )  # fmt: skip
         return self.planner.plan(scene, alternatives=0, exclude=self.record.excluded)
