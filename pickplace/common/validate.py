@@ -162,8 +162,11 @@ def odd_number(key: str, value, least: int = 1, most: int = 99) -> int:
 
 
 def or_null(check: Callable[..., Any], key: str, value, *limits) -> Any:
-    """Return None for None, and the result of a validator for any other value."""
-    return None if value is None else check(key, value, *limits)
+    """Return None for None, and the result of a validator for any other value; its error also names null."""
+    if value is None:
+        return None
+    with reword_errors(ValueError, lambda error: ValueError(f"{str(error).rstrip('.')}, or null.")):
+        return check(key, value, *limits)
 
 
 def check_inputs(key: str, count: int) -> None:

@@ -10,10 +10,15 @@ false one, and the share of good scenes that are refused although their clean im
 import sys
 from collections import Counter
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
-from pickplace import Box, Camera, CellSpec, DepthMapError, Planner, Scene
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from plane import common, contains, disc, overlap  # noqa: E402
+
+from pickplace import Box, Camera, CellSpec, DepthMapError, Planner, Scene  # noqa: E402
 
 SHAPE, FOCAL, HEIGHT, NOISE, ACCURACY = (240, 320), 620.0, 1.2, 0.0015, 0.003
 TOUCH = 0.0005  # depth of an overlap that is a collision, m
@@ -270,44 +275,6 @@ def record_of(draw, truth: Truth) -> list[Box]:
 # ---------------------------------------------------------------------------------------------------- the check
 
 
-def overlap(a: np.ndarray, b: np.ndarray) -> float:
-    """How deep two convex polygons, counter-clockwise, overlap; below 0 if they are apart."""
-    depth = np.inf
-    for one, other in ((a, b), (b, a)):
-        edges = np.roll(one, -1, 0) - one
-        normals = np.stack([edges[:, 1], -edges[:, 0]], -1) / np.linalg.norm(edges, axis=1, keepdims=True)
-        depth = min(depth, -float(((other @ normals.T).min(0) - (one * normals).sum(1)).max()))
-    return depth
-
-
-def common(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The part of a convex polygon that lies in another."""
-    for start, end in zip(b, np.roll(b, -1, 0), strict=True):
-        edge, kept = end - start, []
-        side = edge[0] * (a[:, 1] - start[1]) - edge[1] * (a[:, 0] - start[0])
-        for number in range(len(a)):
-            here, there = side[number], side[(number + 1) % len(a)]
-            if here >= 0:
-                kept.append(a[number])
-            if (here >= 0) != (there >= 0):
-                kept.append(a[number] + (a[(number + 1) % len(a)] - a[number]) * here / (here - there))
-        a = np.array(kept)
-        if len(a) < 3:
-            return np.zeros((0, 2))
-    return a
-
-
-def contains(polygon: np.ndarray, points: np.ndarray) -> bool:
-    edges = np.roll(polygon, -1, 0) - polygon
-    normals = np.stack([edges[:, 1], -edges[:, 0]], -1) / np.linalg.norm(edges, axis=1, keepdims=True)
-    return bool(((points @ normals.T) - (polygon * normals).sum(1) <= TOUCH).all())
-
-
-def disc(diameter: float) -> np.ndarray:
-    angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)
-    return np.stack([np.cos(angle), np.sin(angle)], -1) * diameter / 2
-
-
 def fault(truth: Truth, plan, cell: str) -> str | None:
     """The first thing that goes wrong when a robot does exactly as the plan says; None if nothing does."""
     spec, side, rim, cup = CELLS[cell]
@@ -318,7 +285,9 @@ def fault(truth: Truth, plan, cell: str) -> str | None:
     at_pick = body @ turned(np.radians(plan.pick.yaw)).T + pick[:2]
     suck = at_pick if cup is None else disc(cup) + pick[:2]
     found = [
-        each for each in truth.in_bin if (contains(suck, each.corners) if cup is None else contains(each.corners, suck))
+        each
+        for each in truth.in_bin
+        if contains(*((suck, each.corners) if cup is None else (each.corners, suck)), TOUCH)
     ]
     if not found:
         return "the cup fits on nothing"

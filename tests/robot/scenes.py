@@ -4,6 +4,7 @@ from dataclasses import dataclass, field, replace
 from math import cos, radians, sin
 
 import numpy as np
+from plane import contains, overlap
 
 from pickplace import Scene
 
@@ -107,25 +108,14 @@ def moved(corners: np.ndarray, centre, yaw: float) -> np.ndarray:
     return np.array(centre) + corners @ np.array([[cos(turn), sin(turn)], [-sin(turn), cos(turn)]])
 
 
-def disc(diameter: float) -> np.ndarray:
-    angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)
-    return np.stack([np.cos(angle), np.sin(angle)], -1) * diameter / 2
-
-
 def squares(cells, size, side: float) -> list[np.ndarray]:
     """The cells ``(x, y)`` of a rectangle of ``size`` cells, from its centre."""
     return [rectangle((np.array(cell) + 0.5 - np.array(size) / 2) * side, (side, side), 0) for cell in cells]
 
 
 def meet(a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether two convex polygons, counter-clockwise, share more than an edge: no side of one parts them."""
-    for one, other in ((a, b), (b, a)):
-        edges = np.roll(one, -1, 0) - one
-        normals = np.stack([edges[:, 1], -edges[:, 0]], -1) / np.linalg.norm(edges, axis=1, keepdims=True)
-        away = (other @ normals.T).min(0) - (one * normals).sum(1)
-        if (away > -EPSILON).any():
-            return False
-    return True
+    """Whether two convex polygons, counter-clockwise, share more than an edge."""
+    return overlap(a, b) > EPSILON
 
 
 def random_scene(
@@ -252,6 +242,4 @@ def within(corners: np.ndarray, room) -> bool:
 
 def inside(corners: np.ndarray, polygon: np.ndarray) -> bool:
     """Whether points lie in a convex polygon, counter-clockwise."""
-    edges = np.roll(polygon, -1, 0) - polygon
-    away = corners[:, None] - polygon
-    return bool((edges[:, 0] * away[..., 1] - edges[:, 1] * away[..., 0] >= -EPSILON).all())
+    return contains(polygon, corners, EPSILON)

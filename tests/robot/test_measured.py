@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scenes import Gripper, World, disc, fault, plan_for, random_scene, rectangle, squares
+from plane import disc
+from scenes import Gripper, World, fault, plan_for, random_scene, rectangle, squares
 
 from pickplace import CellSpec, DepthMapError, Planner
 from pickplace.robot import planner as robot_planner
