@@ -1,7 +1,7 @@
 """Checks of settings: each returns the value, or raises a ``ValueError`` that names the key and what was expected."""
 
+import math
 import os
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from numbers import Integral, Real
@@ -95,8 +95,10 @@ def is_whole(value) -> bool:
 
 def is_number(value: Any) -> bool:
     """Return whether a value is a finite real number, and not a bool."""
-    is_real = isinstance(value, Real) and not isinstance(value, bool)
-    return is_real and -sys.float_info.max <= value <= sys.float_info.max
+    try:
+        return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:  # a whole number that no float can hold
+        return False
 
 
 def whole_number(key: str, value, least: int = 1, most: int = MAX_COUNT) -> int:

@@ -40,6 +40,8 @@ def merge_trained(cfg: DictConfig, trained: DictConfig) -> DictConfig:
     groups = OmegaConf.create({key: OmegaConf.to_container(cfg[key], resolve=False) for key in ("env", "items")})
     ours, changed = [], trained.copy()
     changed.evaluation = cfg.evaluation
+    if "cell_size" not in changed.env:  # of an older checkpoint; items of the command line may refer to it
+        OmegaConf.update(changed, "env.cell_size", groups.env.cell_size, force_add=True)
     for word in task_overrides():
         key, _, option = word.lstrip("+~").partition("=")
         if key == "benchmark":

@@ -81,7 +81,7 @@ class _Batch:
     def feasible_shares(self) -> float:
         """Return the share of the ``N_a`` actions that are feasible, summed over the running episodes."""
         cell = self.env.cell
-        share = num_feasible(cell, placing_maps(cell, self.env.state)) / cell.num_actions
+        share = num_feasible(cell, placing_maps(cell, self.env.state)).double() / cell.num_actions
         return float(share[self.running].sum())
 
     def record(self, planner: BatchPlanner, action: Tensor) -> None:

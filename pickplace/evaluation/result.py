@@ -52,7 +52,7 @@ def describe(planner: BatchPlanner, facts: dict, episodes: Episodes) -> dict:
         episodes: the results.
     """
     occupancy, true, count = episodes.occupancy, episodes.true_occupancy, episodes.num_items
-    placed = _share(episodes.items_placed / count) if (count > 0).all() else None
+    placed = _share(episodes.items_placed.double() / count) if (count > 0).all() else None
     reasons = Counter(Failure(code).name.lower() for code in episodes.failure.tolist())
     return {
         "planner": planner.name,

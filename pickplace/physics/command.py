@@ -25,7 +25,9 @@ def main() -> None:
                 settings.merge_with_dotlist([word])
             except (YAMLError, ValueError) as error:
                 raise ValueError(f"{word}: expected <key>=<value>, such as friction=0.3.") from error
-        for outcome in build_engine(settings).carry_out(read_plans(arguments.plans)):
+        plans = read_plans(arguments.plans)
+        refuse_if(not plans, f"{arguments.plans}: no placement in it; expected a line for each.")
+        for outcome in build_engine(settings).carry_out(plans):
             write_output(json.dumps(outcome.facts()) + "\n")
 
 

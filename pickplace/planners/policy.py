@@ -13,7 +13,7 @@ from pickplace.policies.footprints import count_ways, rank_footprints
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import PICKS, join_pick, select_pick
 from pickplace.rules.item import Observation
-from pickplace.rules.masks import PlacingMaps, action_mask, placing_maps
+from pickplace.rules.masks import PlacingMaps, action_footprints, action_mask, placing_maps
 from pickplace.rules.state import State
 
 
@@ -98,14 +98,19 @@ class PolicyPlanner(MapPlanner):
     def heat_map(self, observation: Observation) -> Tensor:
         """Return the policy's greatest probability over picks and rotations for each place cell, ``[N, W_T, D_T]``.
 
-        With ``candidates="all"`` only feasible actions count, and if a pick is chosen first, only the actions of that
-        pick.
+        With ``candidates="all"`` only feasible actions count: with a rule for the item or the pick only those of its
+        items, or of that pick.
         """
         cell = self.cell
         score = self.policy.action_log_probs(observation).exp()
         if self.candidates == "all":
-            maps = placing_maps(cell, State.from_observation(observation))
+            state = State.from_observation(observation)
+            maps = placing_maps(cell, state)
             score = torch.where(action_mask(cell, maps), score, 0.0)
+            if self.item != "any":
+                allowed = restrict_items(cell, self.item, state, self.policy.ranked(maps))
+                to = action_footprints(cell, state.items, maps.blocked)
+                score = torch.where((to >= 0) & allowed.gather(1, to.clamp(min=0)), score, 0.0)
             if self.pick != "any":
                 score = select_pick(cell, score, PICKS[self.pick](cell, maps.item, maps.blocked))
         return score.view(len(score), -1, *cell.tote_size[:2], cell.rotations).amax((1, 4))

@@ -30,6 +30,11 @@ class Box:
     mass: float = 0.0  #: kg; 0: not known: the box may lie only on items that bear any load
     max_load: float | None = None  #: greatest mass on top of it, kg; 0: nothing may lie on it; None: any
 
+    def __post_init__(self):
+        for name, value in [*vars(self).items()]:
+            if getattr(value, "shape", None) == ():  # a numpy number, which JSON does not hold
+                object.__setattr__(self, name, value.item())
+
     def upright(self) -> "Box":
         """Return the same cuboid with a yaw above -45 and at most 45 degrees."""
         quarters = math.ceil(self.yaw / 90 - 0.5 - 1e-9)

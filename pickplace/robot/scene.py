@@ -168,9 +168,10 @@ class Scene:
         boxes = () if isinstance(self.items, BinMap) else self.items
         if likely is None and not any(box.edge_error for box in boxes):
             return None
-        narrower = [
-            replace(box, w=box.w - 2 * box.edge_error, d=box.d - 2 * box.edge_error, edge_error=0.0) for box in boxes
-        ]
+        narrower = []
+        for box in boxes:
+            w, d = (max(side - 2 * box.edge_error, MILLIMETRE) for side in (box.w, box.d))
+            narrower.append(replace(box, w=w, d=d, edge_error=0.0))
         return replace(self, items=narrower if boxes else self.items, tote=likely or self.tote)
 
 
@@ -184,6 +185,6 @@ def _check_boxes(key: str, boxes: Any) -> None:
     for at, box in enumerate(boxes):
         for name in (field.name for field in fields(Box)):
             value, (least, what, unit) = getattr(box, name), MIN_FIELD_VALUES.get(name, (-MAX_VALUE, "", ""))
-            expected = f"{what} of at least {least:g} {unit}" if unit else "a finite number"
+            expected = f"{what} from {least:g} to {MAX_VALUE:g} {unit}" if unit else f"-{MAX_VALUE:g} to {MAX_VALUE:g}"
             good = is_number(value) and least <= value <= MAX_VALUE or (name == "max_load" and value is None)
             refuse_if(not good, f"{key}[{at}].{name}={excerpt(value)}: expected {expected}.", DepthMapError)

@@ -42,12 +42,16 @@ class DecisionLog:
         self._append({"time": time.time(), "seconds": round(seconds, 6), "request": given, "reply": reply})
 
     def _append(self, line: dict | None = None) -> None:
-        with self._path.open("a") as file:
-            if self._is_new or file.tell() == 0:  # each file names the planner of its plans
-                file.write(json.dumps({"start": self._start, "time": time.time()}) + "\n")
-                self._is_new = False
+        with self._path.open("ab+") as file:
+            size, lines = file.tell(), []
+            if self._is_new or size == 0:  # each file names the planner of its plans
+                lines.append(json.dumps({"start": self._start, "time": time.time()}))
             if line is not None:
-                file.write(json.dumps(line, default=vars) + "\n")  # `default` is for boxes
+                lines.append(json.dumps(line, default=vars))  # `default` is for boxes
+            file.seek(max(0, size - 1))
+            is_torn = file.read(1) not in (b"", b"\n")  # by a crash or a full disk
+            file.write(("\n" * is_torn + "".join(f"{each}\n" for each in lines)).encode())
+            self._is_new = False
 
 
 def service_facts(planner: "Planner", args) -> dict[str, Any]:
@@ -71,8 +75,8 @@ def replay(path: str, make) -> tuple[int, list[str]]:
         make: makes a planner from the value of ``start``.
 
     Returns:
-        The number of equal plans, and a sentence for each plan that differs. Requests without a plan are left out, such
-        as those that passed their deadline.
+        The number of equal plans, and a sentence for each plan that differs, and for each torn line. Requests without a
+        plan are left out, such as those that passed their deadline.
 
     Raises:
         ValueError: naming the file and the line, for a line that no service wrote, or a planner that cannot be made
@@ -81,6 +85,10 @@ def replay(path: str, make) -> tuple[int, list[str]]:
     same, differing, planner = 0, [], None
     for number, line in _lines(path):
         place = f"{path}, line {number}"
+        if isinstance(line, str):
+            refuse_if(planner is None, f"{place}: {line}")
+            differing.append(f"{place}: {line}")
+            continue
         try:
             if "start" in line:
                 planner = make(line["start"])
@@ -103,11 +111,12 @@ def _again(planner: "Planner", line: dict) -> Answer:
     return solve(planner, PlanRequest.parse(line["request"], {}), beginning, Deadline(MAX_DEADLINE))
 
 
-def _lines(path: str) -> Iterator[tuple[int, dict]]:
+def _lines(path: str) -> Iterator[tuple[int, dict | str]]:
+    """Yield each line with its number; a sentence in place of one that is no object."""
     for number, text in enumerate(read_text(path, MAX_BYTES).splitlines(), 1):
         try:
             line = json.loads(text)
             refuse_if(not isinstance(line, dict), f"got {type(line).__name__}")
+            yield number, line
         except (ValueError, RecursionError) as error:
-            raise ValueError(f"{path}, line {number}: expected an object in JSON ({error}).") from error
-        yield number, line
+            yield number, f"expected an object in JSON ({error})."

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from pickplace.robot.scene import Scene
     from pickplace.rules.cell import CellSpec
 
+MAX_DIGITS = 300  # of a whole number; a float holds no more
+MAX_NESTED = 100  # lists and objects in an id
 MAX_REQUEST = 2**24  # greatest length of a request, in bytes, whatever the cell
 DEADLINE, MAX_DEADLINE = 10.0, 3600.0  # default and greatest time until an answer, in seconds
 
@@ -183,8 +185,9 @@ def parse_json(text: bytes) -> dict:
         lambda error: ValueError(f"the request is not JSON: {error}."),
     ):
         given = json.loads(
-            text.decode(), parse_constant=finite_float, parse_float=finite_float, object_pairs_hook=unique_keys
-        )
+            text.decode(), parse_constant=finite_float, parse_float=finite_float, parse_int=short_int,
+            object_pairs_hook=unique_keys,
+        )  # fmt: skip
     refuse_if(
         not isinstance(given, dict), f"got {type(given).__name__}, expected an object with bin_depth and tote_depth."
     )
@@ -198,6 +201,13 @@ def finite_float(text: str) -> float:
     raise ValueError(f"the request is not JSON: got {text[:20]}, expected a finite number.")
 
 
+def short_int(text: str) -> int:
+    """Return a whole number of a JSON text; refuse one with so many digits that Python does not read it."""
+    if len(text) <= MAX_DIGITS:
+        return int(text)
+    raise ValueError(f"the request is not JSON: got {text[:20]}..., expected at most {MAX_DIGITS} digits.")
+
+
 def read_request(text: bytes, limits: RequestLimits, defaults: dict) -> tuple[int, dict, PlanRequest | None]:
     """Return the HTTP status 200, the beginning of the reply with the ``id``, and the request that a text states.
 
@@ -207,6 +217,8 @@ def read_request(text: bytes, limits: RequestLimits, defaults: dict) -> tuple[in
     try:
         limits.check(text)
         given = parse_json(text)
+        nested = sum(json.dumps(given.get("id")).count(bracket) for bracket in "[{")
+        refuse_if(nested > MAX_NESTED, f"id: it holds {nested} lists and objects, expected at most {MAX_NESTED}.")
         status, reply = 422, {key: given[key] for key in ("id",) if key in given}
         return 200, reply, PlanRequest.parse(given, defaults)
     except ValueError as error:

@@ -135,9 +135,9 @@ class Service:
         """Record an answer for the page, the metrics and the log."""
         entry = live.entry(self.planner.cell, 0, request, found.reply, seconds)
         with self.lock:  # two threads may call this
-            self.metrics.count(found.status, found.reply.get("status", ""))
-            if self.log is not None:
+            if self.log is not None:  # first: a plan that cannot be logged is not returned
                 self.log.add(request, found.reply, seconds)
+            self.metrics.count(found.status, found.reply.get("status", ""))
             self.history.append({**entry, "number": self.count + 1})
             self.count += 1  # last, so that each number that a reader sees has its answer
 

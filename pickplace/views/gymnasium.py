@@ -10,6 +10,7 @@ import torch
 
 from pickplace.common.validate import expect
 from pickplace.envs.gymnasium import PickPlaceGymEnv
+from pickplace.items.tipping import sizes_in_bin
 from pickplace.rules.item import bin_depth_from_items
 from pickplace.rules.state import Failure
 from pickplace.views.figures import INK
@@ -35,7 +36,7 @@ class RenderedPickPlaceEnv(PickPlaceGymEnv):
         super().__init__(items, **settings)
         self.render_mode = render_mode
         self._recording: Recording | None = None  # of the running episode
-        self._colours = item_colours(self._env.items.sizes.tolist()) if render_mode else {}
+        self._colours = item_colours(sizes_in_bin(self._env.cell, self._env.items).tolist()) if render_mode else {}
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         result = super().reset(seed=seed, options=options)

@@ -77,12 +77,12 @@ class Recording:
             if not move.failure
         ]
 
-    def describe_ending(self, num_places: int) -> str:
+    def describe_ending(self, cell: CellSpec) -> str:
         """Return the reason why the episode ended, as a sentence; empty while it goes on."""
         if self.ending == Failure.STUCK:
-            if sum(box.volume for box in self.boxes) == num_places * self.tote_height:
+            if sum(box.volume for box in self.boxes) == cell.num_places * self.tote_height:
                 return FULL
-            if len(self.waiting) > 1:
+            if len(self.waiting) > cell.poses:  # an item in all its poses is one
                 return "None of these items fits anywhere any more."
         return "" if self.ending is None else self.ending.sentence
 

@@ -81,7 +81,7 @@ def _cells(height: int, cell: CellSpec) -> int | float:
 def _episode(recording: Recording, cell: CellSpec) -> dict:
     """Return the page's data of an episode; all lengths are in cells."""
     heat = [move.heat for move in recording.moves if move.heat is not None]
-    ending = recording.describe_ending(cell.num_places)
+    ending = recording.describe_ending(cell)
     label = "goes on" if recording.ending is None else "full" if ending == FULL else recording.ending.label
     # One flat list a move: 5 of the item, 2 pick, 2 place, rotation, 4 of the footprint, z, failure code.
     moves = [

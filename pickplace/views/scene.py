@@ -48,7 +48,7 @@ def draw_scene(recording: Recording, cell: CellSpec, colours: dict[Kind, str], m
     share = np.floor(1000 * sum(box.volume for box in boxes) / np.prod(size) + 1e-9) / 10  # down: 100% is full
     caption = f"{_sides(size, cell)} tote, {share:.1f}% full, {len(boxes)} items placed"
     if len(done) == len(recording.moves) and recording.ending is not None:
-        caption += f". {recording.describe_ending(cell.num_places)}"
+        caption += f". {recording.describe_ending(cell)}"
     figure.suptitle(caption, color=INK, fontsize="x-large")
     return figure
 

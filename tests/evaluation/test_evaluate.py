@@ -94,7 +94,10 @@ def test_larger_benchmarks_are_gopt_rs_on_a_finer_grid(side, episodes):
 
 def test_orders_with_a_checkpoint_have_its_cells():
     words = ["checkpoint=pretrained/warehouse", "items=orders", "items.path=docs/examples/orders/orders.csv"]
-    for extra, expected in ([], (0.02, 0.25)), (["env.cell_size=0.03", "items.height_unit=0.5"], (0.03, 0.5)):
+    older = ["checkpoint=pretrained/mixed"]  # its config has no size of a cell
+    for extra, expected in (
+        ([], (0.02, 0.25)), (["env.cell_size=0.03", "items.height_unit=0.5"], (0.03, 0.5)), (older, (0.05, 1)),
+    ):  # fmt: skip
         with evaluation_config(*words, *extra) as cfg:
             load_trained(cfg)
         assert (cfg["items"].cell_size, cfg["items"].height_unit) == expected

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from problems import SETTINGS, random_states
+from problems import SETTINGS, late_state, random_states
 from untrained import untrained_policy
 
 from pickplace import PickPlaceEnv
@@ -135,3 +135,15 @@ def test_bad_candidates_are_refused(candidates):
     env = PickPlaceEnv(num_envs=1)
     with pytest.raises(ValueError, match=r"planner.candidates=.*expected 'all' or a whole number"):
         PolicyPlanner(env.cell, None, candidates)
+
+
+@pytest.mark.parametrize("rule", ["first", "nearest"])
+def test_a_heat_map_shows_the_items_that_the_rule_allows(rule):
+    settings = {"bin_size": (7, 7, 1), "tote_size": (5, 6, 4), "bin_items": 3, "num_envs": 12}
+    env, observation = late_state(4, masks=("action",), **settings)
+    policy = untrained_policy(env.cell)
+    planner, free = PolicyPlanner(env.cell, policy, item=rule), PolicyPlanner(env.cell, policy)
+    heat, all_heat = (each.heat_map(observation).flatten(1) for each in (planner, free))
+    place = planner.decide(observation.exclude("action_mask")) // env.cell.rotations % env.cell.num_places
+    assert (heat.gather(1, place[:, None]) > 0).all()
+    assert (heat <= all_heat).all() and ((heat == 0) & (all_heat > 0)).any()

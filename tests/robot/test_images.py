@@ -163,7 +163,7 @@ def test_the_cup_goes_where_an_item_is_for_sure():
     for error, status in ((0.0, "ok"), (0.03, "impossible")):
         box = Box(0.15, 0.15, 0.12, 0.12, 0.06, edge_error=error)
         assert planner.plan(Scene([box], tote, cell_size=0.02, tote_height=0.22)).status == status
-    with pytest.raises(DepthMapError, match=r"items\[0\].edge_error=-1: expected a length of at least 0 m"):
+    with pytest.raises(DepthMapError, match=r"items\[0\].edge_error=-1: expected a length from 0 to 1000 m"):
         Scene([Box(0.15, 0.15, 0.09, 0.09, 0.06, edge_error=-1)], tote, cell_size=SIZE)
 
 

@@ -60,8 +60,10 @@ def test_command_refuses_in_one_sentence(command, tmp_path, arguments, message):
 def test_command_answers_json_lines_and_survives_bad_ones(command):
     good = {"bin_depth": ITEM.tolist(), "tote_depth": EMPTY.tolist(), "alternatives": 0}
     lines = [
+        (b'{"id": ' + b"[" * 200 + b"]" * 200 + b"}", "id: it holds 200 lists and objects, expected at most 100"),
         (b"not json", "not JSON"), (b"\xff\xfe", "utf-8"), (b"[" * 2_000, "recursion"), (b"[1, 2]", "got list"),
-        (b"9" * 10_000, "value has 10000 digits"), (b"[" * 100_000, "100,000 lists, rows of maps included"),
+        (b"9" * 10_000, "got 99999999999999999999..., expected at most 300 digits"),
+        (b"[" * 100_000, "100,000 lists, rows of maps included"),
         (b'{"id": 1, "tote_depth": [[5]], "id": 1}', "'id' stands twice in an object"),
         (b'{"items": [{"x": 1, "x": 1}]}', "'x' stands twice"),
     ]  # fmt: skip
@@ -83,9 +85,9 @@ def test_command_answers_json_lines_and_survives_bad_ones(command):
     assert "sys." not in out
     for reply, (_, expected) in zip(replies, lines, strict=True):
         assert ("error" in reply) == (expected is not None) and (expected or "") in reply.get("error", ""), reply
-    assert [reply.get("id") for reply in replies] == [None] * 8 + [request.get("id") for request, _ in requests]
+    assert [reply.get("id") for reply in replies] == [None] * 9 + [request.get("id") for request, _ in requests]
     assert [reply["id"] for reply in replies if reply.get("empty_bin")] == [9]
-    first, *_, stuck, last = replies[8:]
+    first, *_, stuck, last = replies[9:]
     assert stuck["status"] == "stuck" and sum(stuck["reasons"].values()) == 3600
     assert {**first, "id": 0} == {**last, "id": 0} and first["status"] == "ok"
 
@@ -273,6 +275,12 @@ def test_a_log_is_replayed(command, tmp_path, monkeypatch):
     assert command("--replay", log) == (0, "3 of 3 plans are the same\n", "")
     DecisionLog(log, service_facts(planner, args))  # the service was started again
     assert log.read_text().splitlines()[:6] == lines and command("--replay", log)[0] == 0
+    whole = log.read_bytes()
+    log.write_bytes(whole[: len("\n".join(lines[:3])) - 40])  # the power fails while a line is written
+    DecisionLog(log, service_facts(planner, args)).add(request, json.loads(lines[3])["reply"], 0.1)
+    code, out, err = command("--replay", log)
+    assert code == 1 and "line 3: expected an object in JSON" in out and out.endswith("1 of 2 plans are the same\n")
+    log.write_bytes(whole)
     changed = json.loads(lines[1])
     changed["reply"]["action"] += 1
     log.write_text("\n".join([lines[0], json.dumps(changed), *lines[2:]]))

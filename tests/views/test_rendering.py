@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+from pickplace.rules.gripper.rules import Overlap
 from pickplace.views import gymnasium as module
 from pickplace.views.scene import draw_scene
 
@@ -76,6 +77,15 @@ def test_several_items_in_the_bin_are_outlined(scenes):
         info = place(info)
     env.render()
     assert scenes[-1][-1].get_suptitle().endswith("None of these items fits anywhere any more.")
+
+
+def test_a_tipped_item_has_a_colour():
+    cell = {"tote_size": (4, 5, 4), "bin_size": (9, 3, 3), "bin_items": 3, "rotations": 1, "tipping": True}
+    env, _ = make(**cell, items=[(1, 2, 3)], gripper=Overlap(size=(1, 1)))
+    _, info = env.reset(seed=5)
+    for choice in (0, -1, 0, -1):  # upright, and tipped
+        info = env.step(int(np.flatnonzero(info["action_mask"])[choice]))[-1]
+        assert env.render().ndim == 3
 
 
 def test_human_mode_without_a_display_warns(monkeypatch):

@@ -84,7 +84,7 @@ def test_several_items_lie_in_the_bin_until_they_are_taken():
             assert len(cells) == len({*cells}) and 2 <= len(lying) <= 3
             assert [item for item in after if item in move.others] and {*move.others} <= {*after}
         assert recording.ending == Failure.STUCK and len(recording.waiting) > 1
-        assert recording.describe_ending(cell.num_places) == "None of these items fits anywhere any more."
+        assert recording.describe_ending(cell) == "None of these items fits anywhere any more."
     episode, recording = unpack(replay.page(result.recordings, cell, ""))["episodes"][0], result.recordings[0]
     assert [[tuple(item) for item in others] for others in episode["others"]] == [m.others for m in recording.moves]
     assert [tuple(item) for item in episode["waiting"]] == recording.waiting
@@ -194,7 +194,7 @@ def test_page_opens_steps_plays_and_changes_episodes(browser, tmp_path):
     wait_until(browser, f"replay.state().at === {len(moves)}")
     end = state()
     assert end["shown"] == len(moves) and not end["playing"]
-    assert end["ending"] == result.recordings[0].describe_ending(cell.num_places)
+    assert end["ending"] == result.recordings[0].describe_ending(cell)
     assert abs(float(end["percent"].rstrip("%")) / 100 - result.recordings[0].occupancy) <= 0.001
     assert colours_on_canvas(browser) > blank
     click["heat"]()
