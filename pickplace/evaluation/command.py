@@ -40,10 +40,10 @@ def merge_trained(cfg: DictConfig, trained: DictConfig) -> DictConfig:
     groups = OmegaConf.create({key: OmegaConf.to_container(cfg[key], resolve=False) for key in ("env", "items")})
     ours, changed = [], trained.copy()
     changed.evaluation = cfg.evaluation
-    if "cell_size" not in changed.env:  # of an older checkpoint; items of the command line may refer to it
-        OmegaConf.update(changed, "env.cell_size", groups.env.cell_size, force_add=True)
     for word in task_overrides():
         key, _, option = word.lstrip("+~").partition("=")
+        if key == "items" and "cell_size" not in changed.env:  # of an older checkpoint; these items may refer to it
+            OmegaConf.update(changed, "env.cell_size", groups.env.cell_size, force_add=True)
         if key == "benchmark":
             ours += ["env=benchmark", "items=benchmark"] if option not in ("", "null") else []
         elif places := places_in_other_groups(word):

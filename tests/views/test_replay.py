@@ -75,6 +75,13 @@ def test_recordings_are_what_happened(cell, planner):
         assert len(recording.boxes) == int(result.items_placed[number])
 
 
+def test_an_item_in_all_its_poses_is_one_item():
+    cell = CellSpec(bin_size=(9, 3, 3), bin_items=3, tipping=True)
+    one, two = (Recording(0, 5, ending=Failure.STUCK, waiting=[(0, 0, 2, 2, 3)] * count) for count in (3, 6))
+    assert one.describe_ending(cell) == Failure.STUCK.sentence
+    assert two.describe_ending(cell) == "None of these items fits anywhere any more."
+
+
 def test_several_items_lie_in_the_bin_until_they_are_taken():
     cell, result = record("several", "joint_dbl")
     for recording in result.recordings:
