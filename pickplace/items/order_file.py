@@ -43,7 +43,7 @@ YES_NO = {
 MILLIMETRES, GRAMS = {"mm": 1.0, "cm": 10.0, "m": 1000.0}, {"g": 1.0, "kg": 1000.0}
 UNITS: dict[str, dict] = {**dict.fromkeys(SIDES, MILLIMETRES), "weight": GRAMS, "max_load": GRAMS}
 DEFAULT_WEIGHT = "kg"
-#: Columns whose absence changes the plan: a column that is almost named like one of them is refused.
+#: Without such a column the plan is another one. So a name that begins like it is refused if the column is missing.
 OPTIONAL = ("quantity", "max_load", "stackable", "nothing_on_top", "orientations")
 COLUMN = re.compile(r"(.*?)\s*(?:[/_ (\[]\s*(mm|cm|m|kg|g)\s*[)\]]?)?")  # a name, and a unit if there is one
 EXPECTED = "columns length, width, height and weight, such as length/mm and weight/kg; and order, id or quantity if any"

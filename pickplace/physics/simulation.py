@@ -21,7 +21,7 @@ from pickplace.views.motion import Motion, Outcome
 REST_SPEEDS = np.repeat((0.002, 0.02), 3)
 #: Time for items to come to rest after a placement, at least and at most, and at the end of an episode; s.
 MIN_WAIT, MAX_WAIT, FINAL_WAIT = 0.06, 1.0, 1.0
-TIME_AFTER_LOSS = 1.0  # time for which a recorded motion goes on after a collapse, s
+TIME_AFTER_LOSS = 1.0  # a recorded motion ends this long after a collapse, s
 CHECK_INTERVAL = 0.02  # time between two looks at the speeds, s
 
 

@@ -141,7 +141,7 @@ def call(callbacks: dict[str, Callback], hook: str, trainer: Any, *arguments: An
         before, where = dict(metrics), f"callbacks.{name}.{hook}"
         try:
             getattr(callback, hook)(trainer, *arguments)
-        except (ArithmeticError, AssertionError, AttributeError, LookupError, NameError, TypeError) as error:
+        except (AssertionError, AttributeError, LookupError, NameError, TypeError, ZeroDivisionError) as error:
             raise ValueError(f"{where} failed: {sentence(error)}") from error
         for key in before:
             refuse_if(

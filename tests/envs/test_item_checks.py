@@ -11,7 +11,7 @@ from pickplace.items.distributions import Kinds
 
 
 class Drawn(Kinds):
-    """A user's kinds, of which only the first may arrive, with one fault."""
+    """A distribution of a user with one fault. Only its first kind arrives."""
 
     def __init__(self, fault, **handling):
         super().__init__([(2, 1, 1), (1, 1, 1)], **handling)
