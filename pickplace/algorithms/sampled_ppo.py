@@ -20,6 +20,8 @@ from pickplace.rules.observation import observe
 from pickplace.rules.state import Failure, State
 from pickplace.rules.step import apply
 
+VALUED_STATES = {"cpu": 1_024, "cuda": 2**20}  # states whose activations in the critic stay in a CPU's caches
+
 
 class SampledPPO(PPO):
     """PPO whose loss is over a few sampled choices (config ``algo=sampled_ppo``).
@@ -114,8 +116,9 @@ class SampledPPO(PPO):
         value = placed * step.item.volume * self.task.reward_scale
         if goes_on.any():
             after = after.rows(goes_on.nonzero()[:, 0])
-            seen = observe(self.task.terms, cell, after, self.critic.in_keys)
-            value[goes_on] += self.gamma * self.critic(TensorDict(seen, [len(after.tote_height)]))["state_value"][:, 0]
+            seen = TensorDict(observe(self.task.terms, cell, after, self.critic.in_keys), [len(after.tote_height)])
+            parts = [self.critic(part)["state_value"] for part in seen.split(VALUED_STATES[row.device.type])]
+            value[goes_on] += self.gamma * torch.cat(parts)[:, 0]
         return value.view(candidates.shape)
 
 

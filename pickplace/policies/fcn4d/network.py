@@ -34,6 +34,8 @@ from pickplace.policies.fcn4d.winograd import SumConvolution, tile_count
 BIN_PADDING, TOTE_PADDING = -1.0, 0.0
 MAX_DEPTH = 10_000  # height units; deeper than any tote
 PAIRS_AT_ONCE = {"cpu": 128, "cuda": 65_536}  # pairs whose hidden activations stay in a CPU's caches
+#: Pairs whose features of the first layer are gathered at a time. The gradient of each time fills whole maps.
+GATHERED_PAIRS = {"cpu": 8_192, "cuda": 65_536}
 FEW_TILES = 4  # for fewer it does not pay to transform the kernel
 TILE_BYTES = 8 * 2**20  # of the tiles computed at a time, which stay in the caches
 PADDED_PAIRS = 64  # the number of pairs is rounded up to a multiple; see PADDED_ROWS in fcn_grasp/network.py
@@ -163,16 +165,17 @@ class Conv4dNet(nn.Module):
         row, pick, place = (F.pad(index, (0, -count % PADDED_PAIRS)) for index in (row, pick, place))
         maps = self._first_layer(*self._prepare(bin_depth, tote_depth))
         first = [part.permute(0, 2, 3, 1).flatten(0, 2) for part in maps]
-        at_once = PAIRS_AT_ONCE[row.device.type]
-        patches = _patches(bin_depth, row, pick).split(at_once), _patches(tote_depth, row, place).split(at_once)
+        gathered, at_once = (pairs[row.device.type] for pairs in (GATHERED_PAIRS, PAIRS_AT_ONCE))
+        patches = _patches(bin_depth, row, pick).split(gathered), _patches(tote_depth, row, place).split(gathered)
         # [filters, place tap * pick tap * filters]
         kernel = self.second.weight.to(self._dtype).permute(0, 4, 5, 2, 3, 1).flatten(1)
         bias = self.second.bias.to(self._dtype)
         parts = []
         for patch in zip(*patches, strict=True):
-            from_bin, from_tote = map(F.embedding, patch, first)
-            hidden = (from_tote[:, :, None] + from_bin[:, None]).relu_().flatten(1)
-            parts.append(F.linear(hidden, kernel, bias).relu_())
+            pieces = (F.embedding(index, maps).split(at_once) for index, maps in zip(patch, first, strict=True))
+            for from_bin, from_tote in zip(*pieces, strict=True):
+                hidden = (from_tote[:, :, None] + from_bin[:, None]).relu_().flatten(1)
+                parts.append(F.linear(hidden, kernel, bias).relu_())
         features = torch.cat(parts).to(self.head.weight.dtype)
         return F.linear(features, self.head.weight.flatten(1), self.head.bias)[:count]
 
