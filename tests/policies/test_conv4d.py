@@ -181,6 +181,25 @@ def test_any_leading_dimensions_and_integer_depths():
     assert_close(critic(bins[0], totes[0]), values[0])
 
 
+def test_critic_equals_its_layers_one_after_the_other():
+    """It takes each different bin once. Values and gradients are those of all bins."""
+    torch.manual_seed(0)
+    critic, every = Conv4d(CellSpec(), filters=4, hidden=8).double(), torch.randint(0, 3, (40, 5, 5)).double()
+    bins, totes = every[torch.randint(0, 3, (40,))], torch.randint(0, 6, (40, 6, 6)).double()
+
+    def plain() -> torch.Tensor:
+        left = torch.stack((totes.mean((1, 2)), totes.amax((1, 2))), dim=1) / 5
+        bin_maps, tote_maps = clip_and_pad(bins, 1, None, -1.0)[:, None], clip_and_pad(totes, 5, None, 0.0)[:, None]
+        return critic.value(torch.cat((critic.bin_layers(bin_maps), critic.tote_layers(tote_maps), left), dim=1))
+
+    results = []
+    for values in (critic(bins, totes), plain()):
+        weighted = (values[:, 0] * torch.arange(40)).sum()
+        results.append([values.detach(), *torch.autograd.grad(weighted, list(critic.parameters()))])
+    for got, want in zip(*results, strict=True):
+        assert_close(got, want)
+
+
 def test_depth_clipping():
     """It makes the tote's height irrelevant to the policy, but not to the critic."""
     bins, totes = depths((5, 5), (6, 6))
