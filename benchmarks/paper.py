@@ -42,10 +42,7 @@ class Training(NamedTuple):
 
 
 #: The paper's network needs this long. The other methods get the same.
-RECIPE = (
-    "experiment=paper_fast env.num_envs=1024 algo.minibatch_size=1024 total_frames=1_600_000 "
-    "curriculum.advance.max_frames_per_level=150_000"
-)
+RECIPE = "experiment=paper_fast"
 #: By method and R.
 TRAININGS = {
     ("fcn4d", 4): Training(RECIPE, 2.0, SMALL + LARGE),

@@ -30,7 +30,7 @@ TRAINING = ["threads=1", "evaluation.episodes=16", "evaluation.batch_size=16"]
 TRAININGS = {
     "quick": "experiment=quick total_frames=8192 evaluation_interval=4096",
     "a2c": "experiment=quick algo=a2c total_frames=6144 evaluation_interval=4096",
-    "paper_fast": "experiment=paper_fast total_frames=3072 evaluation_interval=2048",
+    "paper_fast": "experiment=paper_fast env.num_envs=256 total_frames=3072 evaluation_interval=2048",
     "paper_masked": "experiment=paper_masked env.num_envs=64 total_frames=2048 evaluation_interval=1024",
     "mixed_grasp": "experiment=mixed_grasp total_frames=6144 evaluation_interval=4096 warm_start.frames=2048"
     " warm_start.critic_frames=2048",
@@ -42,8 +42,9 @@ TRAININGS = {
     " total_frames=8192 evaluation_interval=4096",
     "imitation_a2c": "experiment=quick algo=a2c warm_start=imitate warm_start.frames=2048"
     " warm_start.critic_frames=2048 total_frames=6144 evaluation_interval=4096",
-    "individual_rl": "experiment=paper_fast model=individual_rl total_frames=2048 evaluation_interval=2048",
-    "typical": "experiment=paper_fast model=typical total_frames=2048 evaluation_interval=2048 env.tote_size=[6,6,2]",
+    "individual_rl": "experiment=paper_fast model=individual_rl env.num_envs=256 total_frames=2048 evaluation_interval=2048",
+    "typical": "experiment=paper_fast model=typical env.num_envs=256 total_frames=2048 evaluation_interval=2048"
+    " env.tote_size=[6,6,2]",
     "multi_sync": "experiment=quick collector=multi_sync curriculum=mixture total_frames=6144 evaluation_interval=4096",
 }
 #: Planners without weights, and searches, on few episodes.
