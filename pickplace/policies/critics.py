@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from pickplace.common.capture import is_capturing
 from pickplace.common.validate import MAX_WIDTH, check_inputs, number, odd_number, one_of, refuse_if, whole_numbers
 from pickplace.policies.base import MAP_KEYS
 from pickplace.policies.depth import clip_depth, item_code
@@ -179,6 +180,6 @@ def _distinct(maps: Tensor) -> tuple[Tensor, Tensor]:
     A single item in a bin has few sizes and places, so a batch has few different bins: about 80 of 1,024. A GPU would
     have to wait for their number.
     """
-    if maps.device.type != "cpu":
+    if is_capturing() or maps.device.type != "cpu":
         return maps, torch.arange(len(maps), device=maps.device)
     return maps.unique(dim=0, return_inverse=True)

@@ -42,7 +42,8 @@ TRAININGS = {
     " total_frames=8192 evaluation_interval=4096",
     "imitation_a2c": "experiment=quick algo=a2c warm_start=imitate warm_start.frames=2048"
     " warm_start.critic_frames=2048 total_frames=6144 evaluation_interval=4096",
-    "individual_rl": "experiment=paper_fast model=individual_rl env.num_envs=256 total_frames=2048 evaluation_interval=2048",
+    "individual_rl": "experiment=paper_fast model=individual_rl env.num_envs=256 total_frames=2048"
+    " evaluation_interval=2048",
     "typical": "experiment=paper_fast model=typical env.num_envs=256 total_frames=2048 evaluation_interval=2048"
     " env.tote_size=[6,6,2]",
     "multi_sync": "experiment=quick collector=multi_sync curriculum=mixture total_frames=6144 evaluation_interval=4096",
