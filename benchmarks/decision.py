@@ -11,25 +11,27 @@ from common import interleave, save, use_one_core
 
 from pickplace import PickPlaceEnv
 from pickplace.planners.policy import PolicyPlanner
+from pickplace.policies.afterstate.policy import AfterstateFcn
 from pickplace.policies.fcn4d.policy import Fcn4d
 from pickplace.policies.fcn_grasp.policy import FcnGrasp
 
 TOTES = ((6, 6, 5), (10, 10, 10), (30, 30, 10))
+#: Policies, each with numbers of candidates. Values know feasible actions only.
 POLICIES = {
-    "fcn_grasp": FcnGrasp,
-    "fcn4d": partial(Fcn4d, mask_infeasible=True, compute_dtype="bfloat16"),
+    "fcn_grasp": (FcnGrasp, (10, "all")),
+    "fcn4d": (partial(Fcn4d, mask_infeasible=True, compute_dtype="auto"), (10, "all")),
+    "afterstate_fcn": (partial(AfterstateFcn, all_views=True), ("all",)),
 }
-CANDIDATES = (10, "all")
 
 
 def deciders(tote_size) -> dict:
     """Return a function that makes one decision, for each policy and number of candidates."""
-    env = PickPlaceEnv(tote_size=tote_size, num_envs=1)
+    env = PickPlaceEnv(tote_size=tote_size, support="half", num_envs=1)
     state = env.rollout(tote_size[0] ** 2 // 2, break_when_any_done=False)[:, -1]["next"]
     calls = {}
-    for name, make in POLICIES.items():
+    for name, (make, numbers) in POLICIES.items():
         policy = make(env.cell).eval()
-        for candidates in CANDIDATES:
+        for candidates in numbers:
             calls[f"{name}, K={candidates}"] = partial(PolicyPlanner(env.cell, policy, candidates).decide, state)
     return calls
 

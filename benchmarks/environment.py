@@ -28,7 +28,7 @@ class Ours:
     """``PickPlaceEnv`` through ``step_and_maybe_reset``."""
 
     def __init__(self, batch: int):
-        self.env = PickPlaceEnv(num_envs=batch)
+        self.env = PickPlaceEnv(support="half", num_envs=batch)
         self.planner = RandomFeasible(self.env.cell)
         self.state = self.env.reset()
 

@@ -2,11 +2,11 @@
 
 The environment is measured against Jumanji's BinPack-v2 on the same card (pip install jumanji and JAX for CUDA; without
 them only ours is measured). *Busy* is the share of the time in which the device works, as PyTorch's profiler sees it.
-``--device cpu`` shows that the script works: with few problems, and without graphs.
+Adds a section to docs/performance.md. ``--device cpu`` shows that the script works: it prints the section, of few
+problems and without graphs.
 """
 
 import argparse
-import json
 import logging
 import os
 import re
@@ -20,6 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+import report
 import torch
 from common import console_command, save
 from environment import Jumanji
@@ -50,7 +51,7 @@ GPU = Sizes(
         "quick_gpu": [],
         "paper_fast_gpu": [],
         "paper_gpu": [],
-        "afterstate benchmark=gopt_rs": ["env.num_envs=1024", "algo.minibatch_size=4096"],
+        "afterstate_gpu benchmark=gopt_rs": [],
     },
     8,
     ["experiment=quick_gpu", "evaluation_interval=250_000"],
@@ -59,7 +60,8 @@ CPU = Sizes(
     (64,),
     {
         "quick_gpu": ["env.num_envs=64", "algo.minibatch_size=128"],
-        "afterstate benchmark=gopt_rs": ["env.num_envs=16", "algo.minibatch_size=64"],
+        "paper_gpu": ["env.num_envs=4", "algo.minibatch_size=64"],
+        "afterstate_gpu benchmark=gopt_rs": ["env.num_envs=16", "algo.minibatch_size=64"],
     },
     5,
     ["experiment=smoke", "device=cpu"],
@@ -84,7 +86,7 @@ def profiled(work: Callable[[], object], device: str) -> dict[str, float]:
     """Return the milliseconds in which the device works in a call, and the number of its kernels."""
     if device == "cpu":
         work()
-        return {}
+        return {"device ms": 0.0, "kernels": 0}
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
         timed(work, device)
     kernels = [each for each in profile.events() if each.device_type == torch.autograd.DeviceType.CUDA]
@@ -120,12 +122,15 @@ def measure_environment(problems: int, device: str, compile: CompileSettings, st
     return {"ms": median, "steps/s": problems / median * 1e3, **profiled(partial(step, frames), device)}
 
 
-def measure_peer(problems: int, steps: int = 30) -> dict | None:
-    """Return the time of a step of Jumanji's environment, or None without it."""
+def measure_peer(problems: int, device: str, steps: int = 30) -> dict | None:
+    """Return the time of a step of Jumanji's environment; None without it, or if JAX has another device."""
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # JAX then leaves memory for torch
     try:
         world = Jumanji(problems)
     except ImportError:
+        return None
+    if world.jax.default_backend() != {"cuda": "gpu"}.get(device, device):
+        sys.stderr.write(f"JAX runs on {world.jax.default_backend()}, not on the GPU: the peer is skipped\n")
         return None
     times = [world.time_step() for _ in range(steps + 5)][5:]
     return {"ms": statistics.median(times), "steps/s": problems / statistics.median(times) * 1e3}
@@ -181,7 +186,7 @@ def main() -> None:
             key: measure_environment(problems, device, CompileSettings(cudagraphs=key == "recorded"))
             for key in COMPILED
         }
-        peer = measure_peer(problems)
+        peer = measure_peer(problems, device)
         result["environment"][problems] = rows | ({"jumanji": peer} if peer else {})
         sys.stderr.write(f"{problems} problems: {result['environment'][problems]}\n")
     for experiment, words in sizes.trainings.items():
@@ -194,8 +199,9 @@ def main() -> None:
     result["seconds until the mark"] = measure_learning(sizes.quick)
     if device == "cuda":
         save("gpu", result)
+        report.main()
     else:
-        sys.stdout.write(json.dumps(result, indent=1) + "\n")
+        sys.stdout.write(report.gpu(result))
 
 
 if __name__ == "__main__":

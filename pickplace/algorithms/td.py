@@ -35,6 +35,8 @@ class TD(MinibatchDescent):
         super().__init__(policy, task, **descent)
         whole_number("rollout_length", task.rollout_length, 2)
         self.network: ToteValue = critic.module
+        mirrored = self.network.mirrored and policy.cell.reach is not None
+        expect(not mirrored, "model.actor.mirrored", True, "false: the robot's reach tells the tote's sides apart")
         scale = self.network.reward_scale
         expect(scale == task.reward_scale, "model.actor.reward_scale", scale, f"reward_scale={task.reward_scale}")
         self.gamma, self.lmbda = number("algo.gamma", gamma, most=1), number("algo.lmbda", lmbda, most=1)

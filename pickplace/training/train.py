@@ -9,6 +9,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 from tensordict import TensorDict
 
+from pickplace.common.graphs import NO_COMPILE
 from pickplace.common.validate import expect
 from pickplace.runs import checkpoint, folder
 from pickplace.runs.locate import locate
@@ -58,6 +59,8 @@ def run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None =
 
 def _run(cfg: DictConfig, run_dir: Path, resume: tuple[dict, dict, Path] | None) -> float:
     trainer = Trainer(cfg, run_dir, resume)
+    if trainer.device.type == "cuda" and trainer.compile == NO_COMPILE:
+        log.info("a GPU waits for Python most of the time; with compile=cudagraphs it repeats captured steps instead")
     with trainer.running() as stop:
         batches = iter(trainer.collector)
         while not (trainer.is_complete or stop.signal):

@@ -376,7 +376,7 @@ def test_an_option_in_two_folders_is_refused(run, tmp_path, option):
 @pytest.mark.parametrize(
     ("name", "words", "expected"),
     [
-        ("train", "--help", "afterstate, buffer, cpu, mixed"),
+        ("train", "--help", "afterstate, afterstate_gpu, buffer, cpu, mixed"),
         ("evaluate", "--help", "best_fit, corner, "),
         ("train", "-m algo.gama=0.9,1", "'gamma'"),
         ("train", "curriculum.levels=[{},{tote_hight:2}]", "curriculum.levels[1]; did you mean 'tote_height'?"),

@@ -374,6 +374,7 @@ def shared(state):
     (["model=afterstate", "algo=td", "model.actor.reward_scale=1"], "model.actor.reward_scale=1: expected reward_s"),
     (["model=afterstate", "algo=td", "model.critic={_target_: pooled}"], "model.critic=.*pooled.*: expected null"),
     (["model=afterstate", "algo=td", "model.actor.temperature=0"], "model.actor.temperature=0: expected a number"),
+    (["model=afterstate", "algo=td", "reach=annulus"], "model.actor.mirrored=True: expected false: the robot's reach"),
 ])  # fmt: skip
 def test_settings_that_do_not_fit_are_refused(words, refusal, tmp_path):
     with pytest.raises(ValueError, match=f"^{refusal}"):

@@ -92,11 +92,15 @@ def test_several_items_in_the_bin_are_resumed_exactly(refill, tmp_path, no_repor
     assert_same(whole, killed)
 
 
-def test_a_preview_is_resumed_exactly(tmp_path, no_report):
+@pytest.mark.parametrize("words", [
+    ["model.actor.hidden=16"],
+    ["model=afterstate_fcn", "model.actor.stem=4", "collector=multi_sync", "collector.workers=2"],
+])  # fmt: skip
+def test_values_with_a_preview_are_resumed_exactly(words, tmp_path, no_report):
     """And trained with: the values learn from what comes."""
     preview = ["env.preview=3", "env.bin_items=2", "curriculum.levels=[{tote_height: 2, preview: 1}, {}]"]
-    preview += ["experiment=afterstate", "curriculum=mixture", "env.tote_size=[5,5,3]", "env.num_envs=8"]
-    preview += ["rollout_length=8", "algo.minibatch_size=32", "model.actor.filters=4", "model.actor.hidden=16"]
+    preview += ["experiment=afterstate", "curriculum=mixture", "env.tote_size=[5,5,3]", "env.num_envs=8", *words]
+    preview += ["rollout_length=8", "algo.minibatch_size=32", "model.actor.filters=4"]
     preview += [f"checkpoint_interval={2 * ITERATION}", f"total_frames={4 * ITERATION}", "evaluation.episodes=4"]
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     whole.mkdir()

@@ -15,7 +15,7 @@ ONE_NETWORK = [word for word in TINY if not word.startswith("model.critic.")]
 
 
 #: Presets that differ from another one in numbers only.
-LIKE_OTHERS = ("mixed_bin3", "paper_fast_gpu", "paper_gpu")
+LIKE_OTHERS = ("afterstate_gpu", "mixed_bin3", "paper_fast_gpu", "paper_gpu")
 
 
 @pytest.mark.parametrize("name", [
