@@ -13,13 +13,12 @@ from pickplace.views.figures import COLOURS, INK, figure_of
 
 TABLE, FIGURE, RUNS = ROOT / "docs" / "results" / "bins.csv", ROOT / "docs" / "bins.png", ROOT / "outputs" / "bins"
 COUNTS = (1, 2, 3, 5)
-VALUES, GRASP, MIXED = ["checkpoint=pretrained/mixed"], ["checkpoint=pretrained/mixed_bin3"], ["items=mixed"]
+VALUES, MIXED = ["checkpoint=pretrained/mixed"], ["items=mixed"]
 #: Method -> its label, and words for pickplace-evaluate.
 METHODS = {
     "learned": ("values of totes, any item", VALUES),
     "beam": ("values of totes, beam search", [*VALUES, "planner=beam"]),
     "learned_first": ("values of totes, first item that has a place", [*VALUES, "planner.item=first"]),
-    "fcn_grasp": ("fcn_grasp, trained with three items", GRASP),
     "joint_dbl": ("joint_dbl, any item", ["planner=joint_dbl", *MIXED]),
     "joint_dbl_first": ("joint_dbl, first item that has a place", ["planner=joint_dbl", "planner.item=first", *MIXED]),
     "individual_first": ("individual_heuristic, first item", ["planner=individual_heuristic", *MIXED]),

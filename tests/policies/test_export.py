@@ -126,17 +126,17 @@ def test_torch_export_takes_any_number_of_items():
         torch.testing.assert_close(program(*example), scores(*example), rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.slow
-def test_several_items_are_an_input(tmp_path):
+@pytest.mark.parametrize("weights", ["mixed", pytest.param("mixed_grasp", marks=pytest.mark.slow)])
+def test_several_items_are_an_input(weights, tmp_path):
     """Each item's part of the scores; with more or fewer items than in training, too."""
     runtime = pytest.importorskip("onnxruntime")
     pytest.importorskip("onnxscript")
     path = tmp_path / "several.onnx"
-    onnx_model.export_onnx("pretrained/mixed_bin3", path)
+    onnx_model.export_onnx(f"pretrained/{weights}", path, bin_items=3)
     session = runtime.InferenceSession(path, providers=["CPUExecutionProvider"])
     assert {entry.name: entry.shape for entry in session.get_inputs()}["items"] == ["N", "M", 5]
     for count in (2, 4):
-        trained = onnx_model._load("pretrained/mixed_bin3", (), bin_items=count, tote_size=(7, 9, 5))
+        trained = onnx_model._load(f"pretrained/{weights}", (), bin_items=count, tote_size=(7, 9, 5))
         seen = trained.make_env(num_envs=3).rollout(4, trained, break_when_any_done=False).reshape(-1)
         keys = [entry.name for entry in session.get_inputs()]
         (found,) = session.run(None, {key: seen[key].numpy() for key in keys})

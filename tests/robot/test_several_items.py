@@ -398,7 +398,7 @@ def test_an_item_that_stands_on_another_is_refused(upper, refused):
         assert plan_for(planner, **given).status == "ok"
 
 
-@pytest.mark.parametrize("weights", ["mixed", "mixed_bin3"])
+@pytest.mark.parametrize("weights", ["mixed", "mixed_grasp"])
 def test_what_is_only_in_the_way_is_no_item(weights):
     """A policy for one item plans beside a box that is not picked, and nothing but the other's way changes."""
     planner, tote = Planner.load(f"pretrained/{weights}", tote_size=(6, 6, 5)), np.full((30, 30), 0.25)

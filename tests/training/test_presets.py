@@ -15,7 +15,7 @@ ONE_NETWORK = [word for word in TINY if not word.startswith("model.critic.")]
 
 
 #: Presets that differ from another one in numbers only.
-LIKE_OTHERS = ("afterstate_gpu", "mixed_bin3", "paper_fast_gpu", "paper_gpu")
+LIKE_OTHERS = ("afterstate_gpu", "paper_fast_gpu", "paper_gpu")
 
 
 @pytest.mark.parametrize("name", [
@@ -29,14 +29,13 @@ def test_every_preset_runs(name, tmp_path, monkeypatch):
     sizes = {
         "smoke": [4, 4, 1],
         "mixed_grasp": [7, 7, 3],
-        "mixed_bin3": [7, 7, 3],
         "mixed": [7, 7, 3],
         "buffer": [7, 7, 5],
         "warehouse": [16, 12, 60],
     }
     extra = [f"env.tote_size={sizes[name]}".replace(" ", "")] if name in sizes else []
     extra += ["items.depth=[9,10]"] * (name == "warehouse")  # fewer kinds
-    extra += ["warm_start.weights=null"] * (name in ("mixed_bin3", "buffer"))  # of another size than these networks
+    extra += ["warm_start.weights=null"] * (name == "buffer")  # of another size than these networks
     extra += ["device=cpu"] * name.endswith("_gpu")
     tiny = TINY if composed(f"experiment={name}")["model"]["critic"] else ONE_NETWORK
     assert 0 <= train(composed(f"experiment={name}", *tiny, *extra), tmp_path) <= 1
