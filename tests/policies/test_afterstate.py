@@ -19,6 +19,7 @@ from pickplace.config.registry import build
 from pickplace.evaluation.play import play
 from pickplace.items.distributions import Uniform
 from pickplace.planners.policy import PolicyPlanner
+from pickplace.policies.afterstate import cells
 from pickplace.policies.afterstate.cells import CellsValue
 from pickplace.policies.afterstate.picture import PictureValue
 from pickplace.policies.afterstate.policy import Afterstate, AfterstateFcn
@@ -270,6 +271,30 @@ def test_a_tote_is_worth_the_same_from_every_side(wide, deep):
         for view in views:
             torch.testing.assert_close(net(*view), each.mean(0))
         assert torch.equal(cells_network(mirrored=False, all_views=True).eval()(*maps, items), each[0])
+
+
+def test_beyond_the_horizon_only_the_volume_counts():
+    """A tote that ends deep below its horizon looks like one that ends there; training looks at the whole depth."""
+    near, far = cells_network(horizon=3.5, level=2.0, reward_scale=0.5), cells_network(level=2.0, reward_scale=0.5)
+    depth = torch.stack([torch.tensor([4.0, 6.0, 8.0, 10.0] * 6)[torch.randperm(24)].view(6, 4) for _ in range(5)])
+    others = random_bearing(depth), random_items(5)
+    with torch.no_grad():
+        assert torch.equal(near(depth + 9, *others), far(depth + 9, *others))
+        near, far = near.eval(), far.eval()
+        at_horizon = far(depth, *others)
+        assert (at_horizon - far(depth + 2, *others)).abs().min() > 0.1
+        assert torch.equal(near(depth + 7, *others), far(depth + 7, *others))  # twice the horizon
+        more = far(depth + 1.5, *others) - at_horizon  # less than a level
+        torch.testing.assert_close(near(depth + 9.5, *others) - near(depth + 8, *others), more)
+        for levels in (4, 1000):
+            beyond = 0.5 * cells.FILLED_BEYOND * 24 * 2 * levels
+            torch.testing.assert_close(near(depth + 2 * levels, *others), at_horizon + beyond)
+        full = depth.clone()
+        full[:, 3, 3] -= 4  # a column whose top is above the lowered tote
+        full[:, 0, 0] += 24 * 8 + 4
+        lowered = (full - 8).clamp(min=0)
+        beyond = 0.5 * cells.FILLED_BEYOND * (full - lowered).sum((1, 2))[:, None]
+        torch.testing.assert_close(near(full, *others), far(lowered, *others) + beyond)
 
 
 class Empty(PictureValue):

@@ -6,10 +6,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pickplace.common.validate import MAX_WIDTH, number, whole_number, whole_numbers
+from pickplace.common.validate import MAX_WIDTH, number, or_null, whole_number, whole_numbers
 from pickplace.policies.afterstate.value import ToteValue
 from pickplace.policies.afterstate.waiting import WaitingItems
 from pickplace.policies.dtypes import matrix_dtype
+
+FILLED_BEYOND = 0.93  # share of the volume beyond the horizon that will be filled
 
 
 class CellsValue(ToteValue):
@@ -34,6 +36,9 @@ class CellsValue(ToteValue):
         filters: width of the others.
         halvings: number of convolutions with stride 2; with 0 the residual ones are as wide as the first.
         layers: number of residual convolutions.
+        horizon: mean depth that is looked at in evaluation mode (``eval()``); levels. In a deeper tote all depths are
+            lowered by the same whole number of levels, as if the tote ended there: :attr:`depth_range` would hide the
+            relief of its surface. It should exceed the tallest item. None: the whole depth.
         **settings: of :class:`~pickplace.policies.afterstate.value.ToteValue`.
     """
 
@@ -49,6 +54,7 @@ class CellsValue(ToteValue):
         filters: int = 64,
         halvings: int = 1,
         layers: int = 2,
+        horizon: float | None = None,
         **settings,
     ):
         super().__init__(**settings)
@@ -58,6 +64,7 @@ class CellsValue(ToteValue):
         whole_number("model.actor.halvings", halvings, 0, 4)
         whole_number("model.actor.layers", layers, 0, 100)
         self.patch = whole_number("model.actor.patch", patch, most=10)
+        self.horizon = or_null(number, "model.actor.horizon", horizon, 1)
         self.joined = patch * 2**halvings  # side of the squares of cells that the strides join into one
         self.around = nn.Conv2d(depth_range + 3, stem, patch + 2, patch)
         self.halves = nn.ModuleList(
@@ -71,6 +78,16 @@ class CellsValue(ToteValue):
         self.head = nn.Conv2d(width, self.joined**2, 1)
         nn.init.normal_(self.head.weight, std=0.01)
         nn.init.constant_(self.head.get_parameter("bias"), 0.5)
+
+    def forward(self, *entries: Tensor) -> Tensor:
+        if self.training or self.horizon is None:
+            return super().forward(*entries)
+        depth, *others = entries
+        mean = depth.mean((-2, -1), keepdim=True) / self.level  # the same for all placements of an item
+        beyond = torch.where(mean > 2 * self.horizon, (mean - self.horizon).floor() * self.level, 0.0)
+        near = (depth - beyond).clamp(min=0)
+        far = (depth - near).sum((-2, -1))[..., None]
+        return super().forward(near, *others) + self.reward_scale * FILLED_BEYOND * far
 
     def chunk_parts(self, *entries: Tensor) -> Tensor:
         """Return the volume that each cell will still take, scaled, float32 ``[N, W_T, D_T]``.
