@@ -2,6 +2,7 @@
 
 from functools import partial
 from statistics import mean
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -278,23 +279,26 @@ def test_beyond_the_horizon_only_the_volume_counts():
     near, far = cells_network(horizon=3.5, level=2.0, reward_scale=0.5), cells_network(level=2.0, reward_scale=0.5)
     depth = torch.stack([torch.tensor([4.0, 6.0, 8.0, 10.0] * 6)[torch.randperm(24)].view(6, 4) for _ in range(5)])
     others = random_bearing(depth), random_items(5)
+
+    def judged(before, after):
+        heights, height = before.amax() - before, before.amax().expand(5)
+        return near.judge(SimpleNamespace(tote_height=height, heights=heights), after, *others)
+
     with torch.no_grad():
-        assert torch.equal(near(depth + 9, *others), far(depth + 9, *others))
+        assert torch.equal(judged(depth + 9, depth + 9), far(depth + 9, *others))
         near, far = near.eval(), far.eval()
-        at_horizon = far(depth, *others)
-        assert (at_horizon - far(depth + 2, *others)).abs().min() > 0.1
-        assert torch.equal(near(depth + 7, *others), far(depth + 7, *others))  # twice the horizon
-        more = far(depth + 1.5, *others) - at_horizon  # less than a level
-        torch.testing.assert_close(near(depth + 9.5, *others) - near(depth + 8, *others), more)
+        assert torch.equal(judged(depth + 7, depth + 7), far(depth + 7, *others))  # twice the horizon
         for levels in (4, 1000):
-            beyond = 0.5 * cells.FILLED_BEYOND * 24 * 2 * levels
-            torch.testing.assert_close(near(depth + 2 * levels, *others), at_horizon + beyond)
-        full = depth.clone()
-        full[:, 3, 3] -= 4  # a column whose top is above the lowered tote
-        full[:, 0, 0] += 24 * 8 + 4
+            deep, beyond = depth + 2 * levels, 0.5 * cells.FILLED_BEYOND * 24 * 2 * levels
+            torch.testing.assert_close(judged(deep, deep), far(depth, *others) + beyond)
+            torch.testing.assert_close(judged(deep + 1.5, deep + 1.5), far(depth + 1.5, *others) + beyond)
+            # Placements that differ in the volume under them are judged by the same part of the tote.
+            torch.testing.assert_close(judged(deep, deep - 3), far(depth - 3, *others) + beyond)
+        full = depth + 8
+        full[:, 3, 3] = 3  # a column whose top is above the lowered tote
         lowered = (full - 8).clamp(min=0)
         beyond = 0.5 * cells.FILLED_BEYOND * (full - lowered).sum((1, 2))[:, None]
-        torch.testing.assert_close(near(full, *others), far(lowered, *others) + beyond)
+        torch.testing.assert_close(judged(depth + 8, full), far(lowered, *others) + beyond)
 
 
 class Empty(PictureValue):

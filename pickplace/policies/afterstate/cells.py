@@ -10,6 +10,7 @@ from pickplace.common.validate import MAX_WIDTH, number, or_null, whole_number, 
 from pickplace.policies.afterstate.value import ToteValue
 from pickplace.policies.afterstate.waiting import WaitingItems
 from pickplace.policies.dtypes import matrix_dtype
+from pickplace.rules.state import State
 
 FILLED_BEYOND = 0.93  # share of the volume beyond the horizon that will be filled
 
@@ -80,15 +81,15 @@ class CellsValue(ToteValue):
         nn.init.normal_(self.head.weight, std=0.01)
         nn.init.constant_(self.head.get_parameter("bias"), 0.5)
 
-    def forward(self, *entries: Tensor) -> Tensor:
+    def judge(self, before: State, *entries: Tensor) -> Tensor:
         if self.training or self.horizon is None:
-            return super().forward(*entries)
+            return self(*entries)
         depth, *others = entries
-        mean = depth.mean((-2, -1), keepdim=True) / self.level  # the same for all placements of an item
+        # From the tote before: all placements in it must be judged by the same part of it.
+        mean = (before.tote_height - before.heights.flatten(1).float().mean(1))[:, None, None] / self.level
         beyond = torch.where(mean > 2 * self.horizon, (mean - self.horizon).floor() * self.level, 0.0)
-        near = (depth - beyond).clamp(min=0)
-        far = (depth - near).sum((-2, -1))[..., None]
-        return super().forward(near, *others) + self.reward_scale * FILLED_BEYOND * far
+        near = torch.where(beyond > 0, (depth - beyond).clamp(min=0), depth)
+        return self(near, *others) + self.reward_scale * FILLED_BEYOND * (depth - near).sum((1, 2))[:, None]
 
     def chunk_parts(self, *entries: Tensor) -> Tensor:
         """Return the volume that each cell will still take, scaled, float32 ``[N, W_T, D_T]``.

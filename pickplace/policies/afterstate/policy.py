@@ -60,7 +60,7 @@ class Afterstate(FootprintPolicy):
     def evaluate_choices(self, before: State, choice: Tensor) -> tuple[State, Tensor, Tensor]:
         after, item = put_down(self.cell, before, choice)
         seen = observe({**STANDARD_TERMS, "items": SeenItems()}, self.cell, after, self.network.in_keys)
-        value = self.network(*(seen[key] for key in self.network.in_keys))[:, 0]
+        value = self.network.judge(before, *(seen[key] for key in self.network.in_keys))[:, 0]
         return after, item.volume, value
 
     def scores(self, observation: Observation, row: Tensor, footprint: Tensor) -> Tensor:

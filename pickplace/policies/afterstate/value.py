@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from pickplace.common.capture import is_capturing
 from pickplace.common.validate import flag, number, one_of
 from pickplace.policies.dtypes import DTYPES
+from pickplace.rules.state import State
 
 FLIPS: tuple[list[int], ...] = ([], [1], [2], [1, 2])  # axes along which maps of totes ``[N, W_T, D_T]`` are flipped
 
@@ -56,6 +57,15 @@ class ToteValue(nn.Module, ABC):
             values = self.parts(*(torch.cat(entry) for entry in views)).flatten(1).sum(1)
             means.append(values.view(len(FLIPS), -1).mean(0))
         return torch.stack(means).mean(0).view(*batch, 1)
+
+    def judge(self, before: State, *entries: Tensor) -> Tensor:
+        """Return the values of totes after a placement, float32 ``[N, 1]``, to compare placements.
+
+        Args:
+            before: the states before the placements, ``[N]``.
+            entries: as in :meth:`forward`, ``[N, ...]``.
+        """
+        return self(*entries)
 
     def parts(self, *entries: Tensor) -> Tensor:
         """Return the parts of the value, float32 ``[N, ...]``, of entries ``[N, ...]``."""
