@@ -37,10 +37,10 @@ class CellsValue(ToteValue):
         filters: width of the others.
         halvings: number of convolutions with stride 2; with 0 the residual ones are as wide as the first.
         layers: number of residual convolutions.
-        horizon: for totes whose mean depth is more than twice this; levels. In evaluation mode (``eval()``) they are
-            judged as if they ended so many levels lower that this mean depth is left. Otherwise ``depth_range`` would
-            hide the relief of their surface, and errors of the shares would count too much. It should exceed the
-            tallest item. None: every tote is judged to its top.
+        horizon: how deep placements are judged in a tote whose mean depth is more than twice this; levels. In
+            evaluation mode (``eval()``) the tote then seems to end so many levels lower that this mean depth is left.
+            Otherwise ``depth_range`` would hide the relief of its surface, and errors of the shares would count too
+            much. It should exceed the tallest item. None: every tote is judged to its top.
         **settings: of :class:`~pickplace.policies.afterstate.value.ToteValue`.
     """
 
