@@ -38,7 +38,7 @@ class CellsValue(ToteValue):
         halvings: number of convolutions with stride 2; with 0 the residual ones are as wide as the first.
         layers: number of residual convolutions.
         horizon: how deep placements are judged in a tote whose mean depth is more than twice this; levels. In
-            evaluation mode (``eval()``) the tote then seems to end so many levels lower that this mean depth is left.
+            evaluation mode (``eval()``) such a tote seems to end lower, by whole levels, with this mean depth left.
             Otherwise ``depth_range`` would hide the relief of its surface, and errors of the shares would count too
             much. It should exceed the tallest item. None: every tote is judged to its top.
         **settings: of :class:`~pickplace.policies.afterstate.value.ToteValue`.
