@@ -175,7 +175,7 @@ class Conv4d(nn.Module):
 
 
 def _distinct(maps: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the different maps among ``[N, 1, W, D]``, and for each of the ``N`` its number among these, int64 ``[N]``.
+    """Return the different maps among ``[N, 1, W, D]``, and each one's number among these, int64 ``[N]``.
 
     A single item in a bin has few sizes and places, so a batch has few different bins: about 80 of 1,024. A GPU would
     have to wait for their number.
