@@ -3,6 +3,7 @@
 import json
 import os
 import platform
+import re
 import statistics
 import subprocess
 import sys
@@ -71,6 +72,15 @@ def spread(values: list[float]) -> dict[str, float]:
     ordered = sorted(values)
     low, high = (ordered[round(share * (len(ordered) - 1))] for share in (0.1, 0.9))
     return {"ms": statistics.median(ordered), "low": low, "high": high, "repeats": len(ordered)}
+
+
+def write_tables(page: Path, tables: dict[str, list[str]]) -> None:
+    """Write tables into a page, each between ``<!-- name: ... -->`` and ``<!-- end -->``."""
+    text = page.read_text()
+    for name, lines in tables.items():
+        pattern = re.compile(rf"(<!-- {name}: [^\n]*-->\n).*?(<!-- end -->)", re.DOTALL)
+        text = pattern.sub(lambda found, lines=lines: "\n".join([found[1], *lines, "", found[2]]), text)
+    page.write_text(text)
 
 
 def machine() -> dict:

@@ -14,7 +14,7 @@ from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
-from common import ROOT, evaluate
+from common import ROOT, evaluate, write_tables
 
 from pickplace.views.figures import COLOURS, INK, figure_of
 
@@ -179,12 +179,9 @@ def draw(lines: dict[str, dict]) -> None:
 
 def write_page() -> None:
     """Write both tables into the page, and draw the figure."""
-    lines, text = read(), PAGE.read_text()
+    lines = read()
     draw(lines)
-    for name, table in {"leaderboard": leaderboard(lines), "gripper": gripper_table(lines)}.items():
-        pattern = re.compile(rf"(<!-- {name}: [^\n]*-->\n).*?(<!-- end -->)", re.DOTALL)
-        text = pattern.sub(lambda found, table=table: "\n".join([found[1], *table, "", found[2]]), text)
-    PAGE.write_text(text)
+    write_tables(PAGE, {"leaderboard": leaderboard(lines), "gripper": gripper_table(lines)})
 
 
 def main() -> None:
