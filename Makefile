@@ -9,7 +9,7 @@ DEMO ?= outputs/demo_$(shell date +%Y-%m-%d_%H-%M-%S)
 ARGS ?=
 PYTEST := $(BIN)/python -m pytest -q -n logical --maxprocesses 4 --dist worksteal
 
-.PHONY: help install demo train test test-slow test-extras coverage chaos fuzz memory camera mutations bench results paper docs walk release lock audit lint format clean
+.PHONY: help install demo train test test-slow test-extras coverage chaos fuzz memory camera mutations bench paper docs walk release lock audit lint format clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -84,10 +84,7 @@ bench: $(STAMP)  ## run the benchmarks on a quiet machine (half an hour), and wr
 		$(BIN)/python benchmarks/$$part.py || exit 1; \
 	done
 
-results: $(STAMP)  ## draw the figures and write the tables of docs/results.md (ARGS="--add NAME evaluation.json" adds rows)
-	$(BIN)/python benchmarks/results.py $(ARGS)
-
-paper: $(STAMP)  ## run the paper's comparison again: train, play, draw (35 hours of one core; goes on where it was stopped)
+paper: $(STAMP)  ## run the paper's comparison: train, play, draw (35 hours of one core; goes on where it was stopped; ARGS=figures only draws)
 	$(BIN)/python benchmarks/paper.py $(ARGS)
 
 docs: $(STAMP)  ## build the site of the docs, with a page of all settings, in outputs/site

@@ -117,6 +117,15 @@ def test_a_plan_is_that_of_the_planner(client):
     assert status == 200 and reply["status"] == "ok" and reply["box"]["yaw"] == pytest.approx(20)
 
 
+def test_weights_of_another_model_and_tote_are_served():
+    scene = {**GRID, "tote_depth": [[8] * 7 + [5]] * 8}
+    with served("pretrained/mixed") as client:
+        status, _, reply = client.plan({**scene, "alternatives": 2})
+    expected = Planner.load("pretrained/mixed").plan(Scene.from_maps(**scene), alternatives=2).as_dict()
+    assert status == 200 and len(reply["alternatives"]) == 2
+    assert reply == json.loads(json.dumps(expected))
+
+
 def serve_forever(output):
     """Run the command in this process, with a token."""
     write_to(output)

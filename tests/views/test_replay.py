@@ -16,6 +16,8 @@ from pickplace import CellSpec, Failure, PickPlaceEnv
 from pickplace.evaluation.play import play
 from pickplace.items.distributions import Kinds, Uniform
 from pickplace.planners.heuristics import JointDBL, UniformRandom
+from pickplace.planners.policy import PolicyPlanner
+from pickplace.policies.afterstate.policy import AfterstateFcn
 from pickplace.views import replay
 from pickplace.views.motion import Motion, Outcome
 from pickplace.views.recording import Move, Recording
@@ -31,6 +33,7 @@ CELLS = {
 PLANNERS = {
     "joint_dbl": JointDBL, "uniform": UniformRandom, "policy": untrained_planner,
     "K=1": partial(untrained_planner, candidates=1),
+    "values": lambda cell: PolicyPlanner(cell, AfterstateFcn(cell, stem=4, filters=8, temperature=1.0).eval()),
 }  # fmt: skip
 
 
@@ -46,7 +49,9 @@ def record(cell, planner):
     return cell, play(make_env, PLANNERS[planner](cell), 4, 2, record=range(3))
 
 
-@pytest.mark.parametrize(("cell", "planner"), [("paper", "joint_dbl"), ("odd", "policy"), ("mixed", "K=1")])
+@pytest.mark.parametrize(
+    ("cell", "planner"), [("paper", "joint_dbl"), ("odd", "policy"), ("mixed", "K=1"), ("mixed", "values")]
+)
 def test_recordings_are_what_happened(cell, planner):
     cell, result = record(cell, planner)
     assert [recording.episode for recording in result.recordings] == [0, 1, 2]
@@ -121,8 +126,9 @@ def unpack(html):
     return json.loads(zlib.decompress(base64.b64decode(packed)))
 
 
-def test_page_is_one_file_that_holds_the_episodes():
-    cell, result = record("paper", "policy")
+@pytest.mark.parametrize("planner", ["policy", "values"])
+def test_page_is_one_file_that_holds_the_episodes(planner):
+    cell, result = record("paper", planner)
     html = replay.page(result.recordings, cell, "a <b> & c")
     data = unpack(html)
     assert "{{" not in html and "<title>a &lt;b&gt; &amp; c</title>" in html
