@@ -75,11 +75,11 @@ def spread(values: list[float]) -> dict[str, float]:
 
 
 def write_tables(page: Path, tables: dict[str, list[str]]) -> None:
-    """Write tables into a page, each between ``<!-- name: ... -->`` and ``<!-- end -->``."""
+    """Write tables into a page, each between ``<!-- name: ... -->`` and ``<!-- end -->``, which must be there."""
     text = page.read_text()
     for name, lines in tables.items():
-        pattern = re.compile(rf"(<!-- {name}: [^\n]*-->\n).*?(<!-- end -->)", re.DOTALL)
-        text = pattern.sub(lambda found, lines=lines: "\n".join([found[1], *lines, "", found[2]]), text)
+        before, mark, rest = re.split(rf"(<!-- {name}: [^\n]*-->\n)", text)
+        text = before + mark + "\n".join(["", *lines, "", "<!-- end -->"]) + rest.partition("<!-- end -->")[2]
     page.write_text(text)
 
 

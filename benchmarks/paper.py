@@ -200,7 +200,8 @@ def summaries() -> list[dict]:
     rows = []
     for cell, by_seed in seeds.items():
         setting = {"method": cell.method, "R": cell.R, "tote": cell.tote, "K": cell.K}
-        rows.append({**setting, "versus": None, **summary([*by_seed.values()])})
+        means = summary([*by_seed.values()])
+        rows.append({**setting, "versus": None, **means, "high": min(means["high"], 1.0)})
         for other, theirs in seeds.items():
             is_pair = other.method != cell.method == "fcn4d" and other[1:3] == cell[1:3]
             if is_pair and other.K in (None, cell.K) and (pairs := paired(by_seed, theirs)):
@@ -328,7 +329,7 @@ def occupancy_table(rows: list[dict]) -> list[str]:
     lines = ["| method | " + " | ".join(totes) + " |", "|---" * (len(totes) + 1) + "|"]
     for method, k in product(LABELS, (10, 1, None)):
         of_totes = [found(rows, method=method, R=4, tote=tote, K=k) for tote in totes]
-        cells = [row and f"{row['mean']:.4f} ±{row['high'] - row['mean']:.4f}" for row in of_totes]
+        cells = [row and f"{row['mean']:.4f} ±{row['mean'] - row['low']:.4f}" for row in of_totes]
         if any(cells):
             name = LABELS[method] + (f", K={k}" if k else "")
             lines.append(f"| {name} | {' | '.join(cell or '' for cell in cells)} |")
