@@ -31,7 +31,7 @@ EPISODES_FILE, CURVES_FILE, PAGE = RESULTS / "episodes.csv", RESULTS / "curves.c
 SMALL, LARGE = ("6x6x5", "6x6x10", "10x10x5", "10x10x10"), ("30x30x5", "30x30x10")
 CANDIDATES = (1, 2, 3, 5, 10, 20, 50)
 QUICK_EPISODES, EPISODES, SLOW_EPISODES = 500, 100, 10  # where a tote takes a moment, seconds, or minutes
-SHIPPED = 1  # seed with the best validation: pretrained/paper; it also plays the large totes
+LARGE_SEED = 1  # only this training seed plays the large totes
 
 
 class Training(NamedTuple):
@@ -104,7 +104,7 @@ class Run(NamedTuple):
         """Yield what its policy plays."""
         for tote in TRAININGS[self.method, self.R].totes:
             if tote in LARGE:
-                every = (1,) if self.seed == SHIPPED else ()
+                every = (1,) if self.seed == LARGE_SEED else ()
             else:
                 every = CANDIDATES if tote == "6x6x5" else (1, 10)
             yield from (Cell(self.method, self.R, tote, k, self.seed) for k in every)
@@ -150,14 +150,19 @@ def train(one: Run) -> None:
     if not (one.folder / "report.html").is_file():
         words = TRAININGS[one.method, one.R].words.split()
         new = [*words, f"seed={one.seed}", f"hydra.run.dir={one.folder}"]
-        stopped = (one.folder / "checkpoints").is_dir()
+        stopped = (one.folder / "checkpoints" / "last").is_dir()
         run("pickplace-train", *([f"resume={one.folder}"] if stopped else new), "threads=1")
+
+
+def unplayed(cells: Iterable[Cell]) -> list[Cell]:
+    """Return the cells that have not been played yet."""
+    known = read_episodes()
+    return [cell for cell in cells if cell not in known]
 
 
 def play(cells: Iterable[Cell]) -> None:
     """Play the test stream in each cell, unless it was played."""
-    known = read_episodes()
-    for cell in [cell for cell in cells if cell not in known]:
+    for cell in unplayed(cells):
         words = [f"env.tote_size=[{cell.tote.replace('x', ',')}]", f"evaluation.episodes={cell.episodes}"]
         words += ["evaluation.batch_size=50", "evaluation.latency_decisions=0"]
         if cell.seed is None:
@@ -167,6 +172,11 @@ def play(cells: Iterable[Cell]) -> None:
         folder = RUNS / "played" / "-".join(str(part) for part in cell if part is not None)
         episodes = evaluate(folder, *words)["occupancy"]["per_episode"]
         append_rows(EPISODES_FILE, [{**cell._asdict(), "occupancies": " ".join(f"{x:.4g}" for x in episodes)}])
+
+
+def has_curve(one: Run) -> bool:
+    """Return whether the learning curve of a training is kept."""
+    return any(one == (row["method"], int(row["R"]), int(row["seed"])) for row in read_rows(CURVES_FILE))
 
 
 def curve(one: Run) -> list[dict]:
@@ -238,9 +248,10 @@ def panels(count: int = 1, width: float = 8, height: float = 4.2, **shared):
     return figure, every
 
 
-def finish(figure, axes, name: str) -> None:
-    """Write a figure with the legend of some axes below it."""
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+def finish(figure, every, name: str) -> None:
+    """Write a figure, with one legend of all its axes below it."""
+    labels = {label: line for axes in every for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(labels.values(), labels, loc="outside lower center", ncols=4, frameon=False)
     figure.savefig(RESULTS / f"{name}.png", dpi=120)
 
 
@@ -260,8 +271,7 @@ def draw_bars(axes, rows: list[dict], methods: tuple[str, ...], totes: tuple[str
             drawn = axes.bar(xs, means, width * 0.92, yerr=[low, high], label=LABELS[method], **style)
             axes.bar_label(drawn, fmt="%.2f", fontsize=7, padding=2)
     axes.set_xticks(range(len(totes)), totes)
-    axes.set_ylim(0, 1.1)
-    axes.set_xlabel("tote")
+    axes.set(xlim=(-0.5, len(totes) - 0.5), ylim=(0, 1.1), xlabel="tote")
 
 
 def draw_candidates(rows: list[dict]) -> None:
@@ -280,7 +290,7 @@ def draw_candidates(rows: list[dict]) -> None:
         axes.minorticks_off()
         axes.set_xlabel("K, most probable actions that are tried")
     every[0].set_ylabel("occupancy")
-    finish(figure, every[-1], "candidates")
+    finish(figure, every, "candidates")
 
 
 def draw_joint_or_individual(rows: list[dict]) -> None:
@@ -290,14 +300,14 @@ def draw_joint_or_individual(rows: list[dict]) -> None:
         draw_bars(axes, rows, ("individual_heuristic", "individual_rl", "fcn4d", "joint_dbl"), SMALL, 10, turns)
         axes.set_title(f"R={turns}, K=10", fontsize=10)
     every[0].set_ylabel("occupancy")
-    finish(figure, every[-1], "joint_or_individual")
+    finish(figure, every, "joint_or_individual")
 
 
 def draw_learning() -> None:
     """Draw validations over frames, and the height of the tote in training, as the paper's Fig. 8."""
     lines = defaultdict(list)  # validations of each training
     for row in read_rows(CURVES_FILE):
-        if row["R"] == "4":
+        if row["R"] == "4" and row["method"] != "fcn4d_noclip":  # which has another tote
             lines[row["method"], row["seed"]].append(row)
     figure, labels = figure_of(8, 5.5), dict(LABELS)
     upper, lower = figure.subplots(2, sharex=True, height_ratios=[2.5, 1])
@@ -312,7 +322,7 @@ def draw_learning() -> None:
     for axes in (upper, lower):
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
-    finish(figure, upper, "learning")
+    finish(figure, [upper], "learning")
 
 
 def draw_methods(rows: list[dict]) -> None:
@@ -320,7 +330,7 @@ def draw_methods(rows: list[dict]) -> None:
     figure, (axes,) = panels(width=10)
     draw_bars(axes, rows, ("mcts", "typical", "fcn4d_noclip", "fcn4d", "joint_dbl"), SMALL + LARGE, 1, 4)
     axes.set_ylabel("occupancy, R=4, K=1")
-    finish(figure, axes, "methods")
+    finish(figure, [axes], "methods")
 
 
 def occupancy_table(rows: list[dict]) -> list[str]:
@@ -339,6 +349,8 @@ def occupancy_table(rows: list[dict]) -> list[str]:
 def draw_all() -> None:
     """Write the table of means, the figures and the page's table, of what is measured."""
     rows = summaries()
+    if not trained_rotations(rows):
+        sys.exit("nothing to draw: no training of fcn4d has been played yet.")
     (RESULTS / "summary.csv").unlink(missing_ok=True)
     append_rows(RESULTS / "summary.csv", rows)
     draw_learning()
@@ -356,14 +368,13 @@ def main() -> None:
     if unknown := [name for name in sys.argv[1:] if name not in names]:
         sys.exit(f"{unknown[0]}: expected names of {', '.join(names)}")
     named = [names[name] for name in sys.argv[1:]]
-    finished = {Run(row["method"], int(row["R"]), int(row["seed"])) for row in read_rows(CURVES_FILE)}
-    left = [each for each in named or every if each not in finished]
+    left = [each for each in named or every if not has_curve(each) or unplayed(each.cells())]
     hours = sum(TRAININGS[each.method, each.R].hours for each in left)
-    sys.stdout.write(f"{len(left)} trainings are left, about {hours:.0f} hours of one core.\n")
+    sys.stdout.write(f"{len(left)} trainings are not finished or not played: at most {hours:.0f} hours of one core.\n")
     for each in left:
         train(each)
-        append_rows(CURVES_FILE, curve(each))
-    for each in named or every:
+        if not has_curve(each):
+            append_rows(CURVES_FILE, curve(each))
         play(each.cells())
     if named:
         return
