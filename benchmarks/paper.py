@@ -256,20 +256,19 @@ def finish(figure, every, name: str) -> None:
 
 
 def draw_bars(axes, rows: list[dict], methods: tuple[str, ...], totes: tuple[str, ...], k: int, turns: int) -> None:
-    """Draw a group of bars for each tote, one for each method, with its interval."""
-    width = 0.8 / len(methods)
-    for order, method in enumerate(methods):
-        bars = []
-        for place, tote in enumerate(totes):
-            trained = (method, turns) in TRAININGS
-            if row := found(rows, method=method, R=turns, tote=tote, K=k if trained else None):
-                bars.append((place + (order - (len(methods) - 1) / 2) * width, row))
-        if bars:
-            xs, means = [x for x, _ in bars], [row["mean"] for _, row in bars]
-            low, high = [row["mean"] - row["low"] for _, row in bars], [row["high"] - row["mean"] for _, row in bars]
-            style = {"color": STYLE[method], "ecolor": "#37474f", "error_kw": {"elinewidth": 1}, "capsize": 2}
-            drawn = axes.bar(xs, means, width * 0.92, yerr=[low, high], label=LABELS[method], **style)
-            axes.bar_label(drawn, fmt="%.2f", fontsize=7, padding=2)
+    """Draw a group of bars for each tote, one for each method that is measured, with its interval."""
+    bars = defaultdict(list)  # of each method: places of totes and rows
+    for method, (place, tote) in product(methods, enumerate(totes)):
+        trained = (method, turns) in TRAININGS
+        if row := found(rows, method=method, R=turns, tote=tote, K=k if trained else None):
+            bars[method].append((place, row))
+    width = 0.8 / max(len(bars), 1)
+    for order, (method, line) in enumerate(bars.items()):
+        xs, means = [place + (order - (len(bars) - 1) / 2) * width for place, _ in line], [r["mean"] for _, r in line]
+        errors = [[row["mean"] - row["low"] for _, row in line], [row["high"] - row["mean"] for _, row in line]]
+        style = {"color": STYLE[method], "ecolor": "#37474f", "error_kw": {"elinewidth": 1}, "capsize": 2}
+        drawn = axes.bar(xs, means, width * 0.92, yerr=errors, label=LABELS[method], **style)
+        axes.bar_label(drawn, fmt="%.2f", fontsize=7, padding=2)
     axes.set_xticks(range(len(totes)), totes)
     axes.set(xlim=(-0.5, len(totes) - 0.5), ylim=(0, 1.1), xlabel="tote")
 
