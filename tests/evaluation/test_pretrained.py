@@ -17,7 +17,7 @@ from pickplace.runs.locate import PRETRAINED
 CARDS = sorted(PRETRAINED.glob(f"*/{export.CARD}"))
 EPISODES = 8
 POLICY_ALONE = (
-    "fcn4d", "mixed", "warehouse", "gopt_rs", "cdrl_rs", "cut1", "cut2", "plate_3x3", "plate_5x5",
+    "paper", "mixed", "warehouse", "gopt_rs", "cdrl_rs", "cut1", "cut2", "plate_3x3", "plate_5x5",
 )  # fmt: skip
 #: The networks of r4, gopt_rs, cut1 and mixed with other weights, or on a finer grid.
 LIKE_OTHERS = ("r1", "r3", "cdrl_rs", "cut2", "warehouse", "plate_3x3")

@@ -31,7 +31,6 @@ TRAININGS = {
     "quick": "experiment=quick total_frames=8192 evaluation_interval=4096",
     "a2c": "experiment=quick algo=a2c total_frames=6144 evaluation_interval=4096",
     "paper_fast": "experiment=paper_fast env.num_envs=256 total_frames=3072 evaluation_interval=2048",
-    "paper_masked": "experiment=paper_masked env.num_envs=64 total_frames=2048 evaluation_interval=1024",
     "mixed_grasp": "experiment=mixed_grasp total_frames=6144 evaluation_interval=4096 warm_start.frames=2048"
     " warm_start.critic_frames=2048",
     "mixed": "experiment=mixed total_frames=8192 evaluation_interval=4096",

@@ -223,8 +223,8 @@ def test_the_scores_of_flat_actions_are_those_of_the_policy():
 def test_fcn4d_scores_every_flat_action(tmp_path):
     runtime = pytest.importorskip("onnxruntime")
     pytest.importorskip("onnxscript")
-    onnx_model.export_onnx("pretrained/fcn4d", tmp_path / "fcn4d.onnx", rotations=3)
-    trained = load_policy("pretrained/fcn4d", tote_size=(8, 7, 5), rotations=3)
+    onnx_model.export_onnx("pretrained/paper", tmp_path / "fcn4d.onnx", rotations=3)
+    trained = load_policy("pretrained/paper", tote_size=(8, 7, 5), rotations=3)
     trained.policy.network.compute_dtype = "float32"
     seen = trained.make_env(num_envs=3).reset()
     session = runtime.InferenceSession(tmp_path / "fcn4d.onnx", providers=["CPUExecutionProvider"])

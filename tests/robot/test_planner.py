@@ -228,7 +228,7 @@ def test_a_planner_takes_a_scene(planner):
 
 
 def test_load():
-    four = plan_for(Planner.load("pretrained/fcn4d"), ITEM, EMPTY, alternatives=3)  # a policy of another kind
+    four = plan_for(Planner.load("pretrained/paper"), ITEM, EMPTY, alternatives=3)  # a policy of another kind
     assert four.status == "ok" and sum(other.chosen for other in four.alternatives) == 1
     shipped = Planner.load("pretrained/r4", tote_size=(8, 7, 9), candidates=10)
     assert shipped.cell.tote_size == (8, 7, 9) and shipped.cell.bin_size == (5, 5, 1)

@@ -198,11 +198,7 @@ def table(heading):
     return [[cell.strip() for cell in row] for row in rows[2:]]
 
 
-def test_the_readme_lists_parameters_topics_and_services(monkeypatch, modules):
-    listed = [
-        (name.strip("`"), yaml.safe_load(default.strip("`")), said) for name, default, said in table("Parameters")
-    ]
-    assert listed == [(name, each.default, each.description) for name, each in modules.parameters.PARAMETERS.items()]
+def test_the_readme_lists_topics_and_services(monkeypatch, modules):
     monkeypatch.setattr(ros.Node, "given", {"checkpoint": "", "planner": "joint_dbl"})
     node = modules.node.PickPlaceNode()
     topics = [name for row in table("Topics") for name in re.findall(r"`([\w/]+)`", row[0])]

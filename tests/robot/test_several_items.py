@@ -348,7 +348,7 @@ def test_those_that_cannot_choose_refuse_in_one_sentence():
     boxes = {"items": [Box(0.05, 0.05, 0.03, 0.03, 0.05), Box(0.2, 0.2, 0.05, 0.05, 0.05)], **FLAT}
     for planner, seen, message in (
         (Planner.load("pretrained/unmasked"), grid, "bin: got 2 items, among which UnmaskedFcnGrasp does not choose"),
-        (Planner.load("pretrained/fcn4d"), boxes, "bin: got 2 items in metres, each on a grid of its own, while Fcn4d"),
+        (Planner.load("pretrained/paper"), boxes, "bin: got 2 items in metres, each on a grid of its own, while Fcn4d"),
         (Planner(CellSpec(), planner=JointDBL(CellSpec())), grid, "was made for a cell with bin_items=1; expected one"),
         (Planner(CellSpec(rotations=1), planner="joint_dbl"), {**boxes, "items": [BOXES[1], BOXES[0]]},
          "items[0].yaw=30: expected 0 with rotations=1"),
@@ -356,7 +356,7 @@ def test_those_that_cannot_choose_refuse_in_one_sentence():
         with pytest.raises(DepthMapError) as caught:
             plan_for(planner, **seen)
         assert message in str(caught.value) and "\n" not in str(caught.value)
-    assert plan_for(Planner.load("pretrained/fcn4d"), **grid, alternatives=2).status == "ok"
+    assert plan_for(Planner.load("pretrained/paper"), **grid, alternatives=2).status == "ok"
     made = Planner(CellSpec(), planner=JointDBL(CellSpec(bin_items=2)))
     assert plan_for(made, **grid).status == "ok"
 

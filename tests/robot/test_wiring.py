@@ -109,7 +109,7 @@ def test_walls_on_the_grid(wall):
     tote, cell = np.full((6, 6), 5), CellSpec(cup_size=(1, 1), pick_rule="seal")
     scene = Scene.from_maps(heights, tote, bin_height=wall)
     assert Planner(cell, planner="joint_dbl").plan(scene).status == ("impossible" if wall == 3 else "ok")
-    for name in ("pretrained/r4", "pretrained/fcn4d"):
+    for name in ("pretrained/r4", "pretrained/paper"):
         same = Planner.load(name, bin_size=(5, 5, wall)).plan(Scene.from_maps(heights, tote))
         assert Planner.load(name).plan(scene) == same and same.status == "ok"
 

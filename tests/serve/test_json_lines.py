@@ -34,7 +34,7 @@ def command(run):
     ("arguments", "message"),
     [
         (["nowhere"], "nowhere"),
-        (["pretrained/none"], "expected pretrained/cdrl_rs, pretrained/cut1, pretrained/cut2, pretrained/fcn4d"),
+        (["pretrained/none"], "expected pretrained/cdrl_rs, pretrained/cut1, pretrained/cut2, pretrained/gopt_rs"),
         (["pretrained/r4", "--bin", "bin.npy"], "--tote: no file"),
         (["pretrained/r4", "--bin", "bin.npy", "--tote", "missing.npy"], "missing.npy: No such file"),
         (["pretrained/r4", "--bin", "bin.npy", "--tote", "pickle.npy"], "pickle.npy: cannot be read; expected a .npy"),
@@ -203,7 +203,7 @@ def test_a_file_holds_the_settings_of_a_planner(command):
         assert code == 2 and message in err, err
 
 
-@pytest.mark.parametrize(("name", "change"), [("fcn4d", "bias"), ("cut1", "scale")])
+@pytest.mark.parametrize(("name", "change"), [("paper", "bias"), ("cut1", "scale")])
 def test_weights_that_lead_to_no_number_are_refused(command, tmp_path, name, change):
     """They are finite, and so is the setting, and the checksum is right: what comes of them is not."""
     state, facts = checkpoint.read(locate(f"pretrained/{name}"))

@@ -276,8 +276,8 @@ def test_a_training_may_begin_with_the_weights_of_another_one(tmp_path, caplog):
     assert "env.tote_size is [6, 5, 2]; those weights were trained with [6, 6, 5]" in caplog.messages
     for message in ("algo.gamma is 0.5; those", "reward_scale is 1; those", "curriculum.levels: NoAdvance plays"):
         assert message in caplog.text  # values of the critic; and levels that are never played
-    bare = Trainer(composed(*words, "model=fcn4d", "warm_start.weights=pretrained/fcn4d"), tmp_path)
-    assert "critic" not in checkpoint.read(locate("pretrained/fcn4d"))[0]
+    bare = Trainer(composed(*words, "model=fcn4d", "warm_start.weights=pretrained/paper"), tmp_path)
+    assert "critic" not in checkpoint.read(locate("pretrained/paper"))[0]
     assert bare.critic.module.value[0].in_features == 64 * (25 + 30) + 2
     narrow = Trainer(composed(*words, "model.critic.hidden=8", "warm_start.weights=pretrained/r4"), tmp_path)
     assert all(map(torch.equal, narrow.policy.parameters(), begun.policy.parameters()))
@@ -286,7 +286,7 @@ def test_a_training_may_begin_with_the_weights_of_another_one(tmp_path, caplog):
 @pytest.mark.parametrize(("weights", "complaint"), [
     ("pretrained/unknown", "the package ships no such weights; expected pretrained/cdrl_rs"),
     ("outputs/nowhere", "no checkpoint there"),
-    ("pretrained/fcn4d", " does not fit these settings"),
+    ("pretrained/paper", " does not fit these settings"),
     (3, "=3: expected a text"),
 ])  # fmt: skip
 def test_weights_that_do_not_serve_are_refused(weights, complaint, tmp_path):
