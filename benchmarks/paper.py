@@ -273,16 +273,18 @@ def draw_bars(axes, rows: list[dict], methods: tuple[str, ...], totes: tuple[str
     axes.set(xlim=(-0.5, len(totes) - 0.5), ylim=(0, 1.1), xlabel="tote")
 
 
-def draw_candidates(rows: list[dict]) -> None:
-    """Draw the occupancy over K, as the paper's Fig. 6."""
-    figure, every = panels(len(trained := trained_rotations(rows)), 6 + 2 * len(trained))
+def draw_candidates(trained: list[int]) -> None:
+    """Draw the occupancy over K, a line for each training seed, as the paper's Fig. 6."""
+    lines: dict[Cell, dict[int, float]] = defaultdict(dict)  # mean by K
+    for cell, episodes in read_episodes().items():
+        if cell.tote == "6x6x5" and cell.K:
+            lines[cell._replace(K=None)][cell.K] = float(np.mean(episodes))
+    figure, every = panels(len(trained), 6 + 2 * len(trained))
     for axes, turns in zip(every, trained, strict=True):
         for method in ("fcn4d", "individual_rl"):
-            line = [row for k in CANDIDATES if (row := found(rows, method=method, R=turns, tote="6x6x5", K=k))]
-            if line:
-                errors = [[row["mean"] - row["low"] for row in line], [row["high"] - row["mean"] for row in line]]
-                style = {"color": STYLE[method], "label": LABELS[method], "marker": "o", "capsize": 3}
-                axes.errorbar([row["K"] for row in line], [row["mean"] for row in line], errors, **style)
+            for line in [line for cell, line in lines.items() if (cell.method, cell.R) == (method, turns)]:
+                style = {"color": STYLE[method], "label": LABELS[method], "marker": "o", "lw": 1.5}
+                axes.plot(sorted(line), [line[k] for k in sorted(line)], **style)
         axes.set_title(f"R={turns}, 6x6x5", fontsize=10)
         axes.set_xscale("log")
         axes.set_xticks(CANDIDATES, CANDIDATES)
@@ -353,8 +355,9 @@ def draw_all() -> None:
     (RESULTS / "summary.csv").unlink(missing_ok=True)
     append_rows(RESULTS / "summary.csv", rows)
     draw_learning()
-    for draw in (draw_candidates, draw_joint_or_individual, draw_methods):
-        draw(rows)
+    draw_candidates(trained_rotations(rows))
+    draw_joint_or_individual(rows)
+    draw_methods(rows)
     write_tables(PAGE, {"occupancy": occupancy_table(rows)})
 
 
