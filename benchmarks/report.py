@@ -175,8 +175,7 @@ def main() -> None:
         "gpu": "" if "gpu" in results else NO_GPU,
         "decision": results["decision"]["rows"]["fcn_grasp, K=all"]["6x6x5"]["ms"],
     }
-    profiles = (Path(__file__).parent / "profiles.md").read_text()
-    PAGE.write_text("\n".join([HEAD.format(**figures), *sections, profiles]))
+    PAGE.write_text("\n".join([HEAD.format(**figures), *sections]))
 
 
 if __name__ == "__main__":

@@ -32,7 +32,6 @@ WORKER_FRAMES, WORKER_REPEATS = 65_536, 3
 WORKER_CASES = {
     "`quick`, all cores": ["experiment=quick", "threads=null"],
     "`quick`, one thread a process": ["experiment=quick"],
-    "`quick`, one thread a process, one pass over a batch": ["experiment=quick", "algo.epochs=1"],
 }
 COLLECTORS = {"single": ["collector=single"], "multi_sync, 2 workers": ["collector=multi_sync", "collector.workers=2"]}
 
