@@ -50,6 +50,14 @@ class ActorCritic(MinibatchDescent):
             not isinstance(policy, EstimatesValue), "algo", type(self).__name__, "algo=td, of whose values it follows"
         )
         expect(critic is not None, "model.critic", critic, "a network, from whose values the advantages follow")
+        self.next_keys = tuple(key for key in critic.in_keys if key.endswith("_mask"))  # GAE values the next state
+        known = {f"{mask}_mask" for mask in policy.masks}
+        expect(
+            known.issuperset(self.next_keys),
+            "model.critic: its masks",
+            self.next_keys,
+            f"among {sorted(known)}, which the policy reads",
+        )
         self.critic, self.gamma = critic, number("algo.gamma", gamma, most=1)
         self.normalize_advantage = flag("algo.normalize_advantage", normalize_advantage)
         coefficients = {

@@ -312,6 +312,8 @@ def test_settings_that_decide_nothing_are_named():
     levels = [{"tote_height": 2}, {}]
     (ignored,) = make(NoAdvance(), levels=levels).unused_settings()
     assert ignored == "curriculum.levels: NoAdvance plays the last level only; expected another curriculum/advance."
+    (ignored,) = make(NoAdvance(), start_height=2).unused_settings()
+    assert ignored.startswith("curriculum.start_height: NoAdvance plays the last level only")
     (ignored,) = make(LearningProgress(), Uniform()).unused_settings()
     assert ignored.startswith("curriculum.sample: Uniform is not used while the weights of LearningProgress draw")
     for used in (make(NoAdvance(), Uniform(), levels=levels), make(Frames(9), levels=levels), make(LearningProgress())):

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from commands import algorithm_of, composed
+from commands import TINY, algorithm_of, composed
 from torch import nn
 from torchrl.modules import ValueOperator
 
@@ -31,6 +31,7 @@ from pickplace.training.curriculum.advance import NoAdvance
 from pickplace.training.curriculum.curriculum import Curriculum
 from pickplace.training.curriculum.sample import Current
 from pickplace.training.progress import has_passed
+from pickplace.training.train import train
 from pickplace.training.trainer import Trainer, episode_metrics, training_env
 
 OBSERVED = ["bin_depth", "tote_depth"]  # by a critic
@@ -46,6 +47,35 @@ class MeanDepthCritic(nn.Module):
 
     def forward(self, bin_depth, tote_depth):
         return self.scale * tote_depth.mean((-2, -1))[..., None]
+
+
+class MaskCritic(nn.Module):
+    """A value that follows from the number of feasible choices."""
+
+    def __init__(self, cell):
+        super().__init__()
+        self.scale = nn.Parameter(torch.tensor(0.1))
+
+    def forward(self, mask):
+        return self.scale * mask.float().mean(-1, keepdim=True)
+
+
+@pytest.mark.parametrize(
+    ("key", "message"),
+    [("footprint_mask", None), ("action_mask", r"model.critic: its masks=.*: expected among \['footprint_mask'\]")],
+)
+def test_a_critic_may_read_the_masks_of_the_policy(key, message, tmp_path, monkeypatch, no_report):
+    """GAE also values the next state, whose mask a batch does not hold otherwise."""
+    monkeypatch.setattr(MaskCritic, "in_keys", (key,), raising=False)
+    words = [word for word in TINY if not word.startswith("model.critic")]
+    cfg = composed(*words, "curriculum=none", "total_frames=32", "trust=test_loop")
+    cfg.model.critic = {"_target_": "test_loop.MaskCritic"}
+    if message:
+        with pytest.raises(ValueError, match=message):
+            trainer.Trainer(cfg, tmp_path)
+    else:
+        train(cfg, tmp_path)
+        assert checkpoint.read(locate(tmp_path))[0]["critic"]["module.scale"] != 0.1
 
 
 @pytest.fixture(scope="module")

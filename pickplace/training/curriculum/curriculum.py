@@ -108,13 +108,15 @@ class Curriculum:
         rule, sampler = type(self.advance).__name__, type(self.sample).__name__
         if self.weights and not isinstance(self.sample, Current):
             return [f"curriculum.sample: {sampler} is not used while the weights of {rule} draw the levels."]
+        is_set = self.given is not None or self.start_height is not None
         if (
-            self.given
-            and len(self.given) > 1
+            is_set
+            and self.start < self.end
             and isinstance(self.advance, NoAdvance)
             and isinstance(self.sample, Current)
         ):
-            return [f"curriculum.levels: {rule} plays the last level only; expected another curriculum/advance."]
+            key = "start_height" if self.given is None else "levels"
+            return [f"curriculum.{key}: {rule} plays the last level only; expected another curriculum/advance."]
         return []
 
     def check_budget(self, total_frames: int, batch: int = 1) -> str | None:
