@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import refuse_if, reword_errors, whole_number
+from pickplace.common.validate import check_bytes, refuse_if, reword_errors, whole_number
 from pickplace.config.registry import find, names_at
 from pickplace.items.order_file import ORIENTATIONS, TURNS, OrderItem
 from pickplace.planners.base import MapPlanner
-from pickplace.rules.cell import MAX_CELLS, MAX_SIDE, CellSpec
+from pickplace.rules.cell import MAX_CELLS, MAX_SIDE, POSES, CellSpec
 from pickplace.rules.gripper.rules import Overlap
 from pickplace.rules.item import NO_LIMIT, Item
 from pickplace.rules.maps import NEVER
@@ -84,9 +84,10 @@ class PackedContainer:
 
 
 class PackingCell(CellSpec):
-    """A cell whose bin is made up for the items, without a limit on the flat actions: packing lists none of them."""
+    """A cell whose bin is made up for the items. Its flat actions are not limited: packing lists none of them."""
 
-    max_actions = 2 * MAX_CELLS**2
+    max_picks = POSES * MAX_CELLS  # an item lies in it on each of its faces
+    max_actions = 2 * POSES * MAX_CELLS**2
 
 
 class OrderPacker:
@@ -221,10 +222,15 @@ class OrderPacker:
             )
         handling = any(item.has_limits for item in items)
         least = min(w * d * _oriented(item, face[0])[2] for item, face, (w, d, *_) in variants)
+        most = min(len(items), int(length * width * self.container[2] / least + 1e-6))
+        tries = 2 * len(SEQUENCES) * (1 + (len(self._faces) > 1))
+        words = (
+            f"{items[0].place}: the order has {len(items):,} items, some with limits, of which {most:,} fit by volume"
+        )
+        check_bytes(words, handling * 3 * tries * most**2)  # tables of the items below one another, while one is added
         return replace(
-            cell, bin_items=len(self._faces), longest_side=max(wide, deep), handling=handling,
-            most_items=min(len(items), int(length * width * self.container[2] / least + 1e-6)),
-        )  # fmt: skip
+            cell, bin_items=len(self._faces), longest_side=max(wide, deep), handling=handling, most_items=most
+        )
 
     def _fill(
         self, cell: CellSpec, planner: MapPlanner, tries: Sequence[tuple[Numbered, Faces]], number: int

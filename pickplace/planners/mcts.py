@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import flag, number, whole_number
+from pickplace.common.validate import check_bytes, flag, number, whole_number
 from pickplace.items.arrival import refill
 from pickplace.items.distributions import ItemDistribution, check_seed, search_items
 from pickplace.planners.base import MapPlanner, narrow_first
@@ -27,6 +27,7 @@ from pickplace.rules.state import State
 from pickplace.rules.step import apply, put_down
 
 MAX_NODES = 1_000_000  # of the trees that are searched at once; more problems are searched in groups
+GROUP_BYTES = 10**9  # of these trees
 
 
 #: Surface, table of the items in the bin, pile, and table of the items that are seen to come, of one problem.
@@ -101,6 +102,8 @@ class MCTS(MapPlanner):
     ):
         self.cell, self.items, self.mask = cell, search_items(items), flag("planner.mask", mask)
         self.simulations = whole_number("planner.simulations", simulations, most=MAX_NODES)
+        self.node_bytes = 1_000 + cell.handling * cell.pile_room**2  # mostly the table of the items below one another
+        check_bytes(f"planner.simulations={simulations} with loads", self.simulations * cell.handling * self.node_bytes)
         self.batch_simulations = whole_number("planner.batch_simulations", batch_simulations, most=4_096)
         self.exploration = number("planner.exploration", exploration, most=1e6)
         self.widening = number("planner.widening", widening, most=1)
@@ -123,7 +126,7 @@ class MCTS(MapPlanner):
 
     def _search(self, state: State, mask: Tensor | None) -> Tensor:
         """Return the most visited choice of each problem, int64 ``[N]``; without a mask it is a flat action."""
-        at_once = MAX_NODES // self.simulations
+        at_once = max(1, min(MAX_NODES, GROUP_BYTES // self.node_bytes) // self.simulations)
         if len(state.surface) > at_once:
             parts = torch.arange(len(state.surface)).split(at_once)
             return torch.cat([self._search(state.rows(part), None if mask is None else mask[part]) for part in parts])

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pickplace.common.validate import refuse_if
+from pickplace.common.validate import excerpt, is_number, refuse_if
 from pickplace.robot.bin_image import find_boxes
 from pickplace.robot.box import ACCURACY, Box, DepthMapError
 from pickplace.robot.depth_image import Heights, Room, read_heights
@@ -48,12 +48,14 @@ class Camera:
     shape: Sequence[int]
 
     def __post_init__(self):
-        for key in ("fx", "fy"):
-            refuse_if(
-                not 0 < getattr(self, key) < math.inf,
-                f"camera.{key}={getattr(self, key)}: expected a number of pixels above 0.",
-            )
-        pose = np.asarray(self.pose, dtype=np.float64)
+        for key, expected in (("fx", " above 0"), ("fy", " above 0"), ("cx", ""), ("cy", "")):
+            value = getattr(self, key)
+            good = is_number(value) and (value > 0 or not expected)
+            refuse_if(not good, f"camera.{key}={excerpt(value)}: expected a number of pixels{expected}.")
+        try:
+            pose = np.asarray(self.pose, dtype=np.float64)
+        except (TypeError, ValueError):
+            pose = np.empty(0)  # which is refused below
         object.__setattr__(self, "pose", pose)
         good = pose.shape == (4, 4) and np.isfinite(pose).all() and np.allclose(pose[3], (0, 0, 0, 1))
         turn = pose[:3, :3] if good else np.zeros((3, 3))

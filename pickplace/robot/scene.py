@@ -4,7 +4,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
-from pickplace.common.validate import excerpt, integral_number, is_number, number, one_of, refuse_above, refuse_if
+from pickplace.common.validate import (
+    excerpt,
+    integral_number,
+    is_number,
+    number,
+    one_of,
+    or_null,
+    refuse_above,
+    refuse_if,
+)
 from pickplace.robot.box import ACCURACY, CLEARANCE, MILLIMETRE, Box, DepthMapError, EmptyBinError, UnknownBox
 from pickplace.robot.camera import Camera
 from pickplace.robot.measure import ToteMap
@@ -142,6 +151,11 @@ class Scene:
         (over_bin, bin_image), (over_tote, tote_image) = bin_view, tote_view
         pixel, clearance = max(over_bin.pixel(), over_tote.pixel()), settings.get("clearance", CLEARANCE)
         number("clearance", clearance, 0, 0.1, "metres")
+        number("accuracy", accuracy, 0, 0.1, "metres")
+        number("cell_size", cell_size, 1e-3, 10, "metres")
+        heights = {"tote_height": tote_height, "bin_height": bin_height, "greatest_height": greatest_height}
+        for key, height in heights.items():
+            or_null(number, key, height, MILLIMETRE, MAX_SIDE * MILLIMETRE, "metres")
         refuse_if(
             clearance < CLEARANCE_PIXELS * pixel - 1e-9,
             f"clearance={clearance:g}: a pixel shows {pixel:.4f} m of the floor; expected at least {CLEARANCE_PIXELS} "

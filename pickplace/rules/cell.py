@@ -99,6 +99,7 @@ class CellSpec:
     pick_rule: InitVar[str | None] = None
     min_seal: InitVar[float | None] = None
 
+    max_picks: ClassVar[int] = MAX_CELLS  # greatest number of cells of the bin
     max_actions: ClassVar[int] = MAX_ACTIONS  # greatest number of flat actions
 
     def __post_init__(self, effector_size, body, cup, cup_size, pick_rule, min_seal):
@@ -130,7 +131,7 @@ class CellSpec:
         expect(isinstance(self.reach, Reach | None), "reach", self.reach, "a Reach, such as an Annulus, or None")
         # Each size is valid alone, but their products may exceed the memory.
         bin_size, tote_size = f"bin_size={[*self.bin_size]}", f"tote_size={[*self.tote_size]}"
-        refuse_above(f"{bin_size}: the bin has", self.num_picks, "cells", MAX_CELLS)
+        refuse_above(f"{bin_size}: the bin has", self.num_picks, "cells", self.max_picks)
         refuse_above(f"{tote_size}: the tote has", self.num_places, "cells", MAX_CELLS)
         refuse_above(f"{bin_size}, {tote_size}: the cell has", self.num_actions, "actions", self.max_actions)
         if self.limits is not None:

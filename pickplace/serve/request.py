@@ -152,7 +152,9 @@ class PlanRequest:
 
     def plan(self, planner: "Planner") -> "Plan":
         """Return the plan for the request; see :meth:`Planner.plan` for errors."""
-        return planner.plan(self.scene(), alternatives=self.alternatives, exclude=self.exclude or ())
+        return planner.plan(
+            self.scene(), alternatives=self.alternatives, exclude=() if self.exclude is None else self.exclude
+        )
 
 
 #: Fields that the command line can set for all requests.

@@ -303,7 +303,7 @@ def test_there_is_room_for_the_items_that_fit_a_container_only():
 
 def test_an_order_is_checked_for_a_cell_that_is_too_fine():
     item = OrderItem("sheet", 2000.0, 1000.0, 5.0, 9, "line 1")
-    with pytest.raises(ValueError, match="^cell=5 mm is too fine: bin_size="):
+    with pytest.raises(ValueError, match="^cell=5 mm is too fine: tote_size="):
         OrderPacker((2000, 1000, 250), 5).check([item])
 
 
@@ -312,6 +312,17 @@ def test_a_sheet_as_large_as_the_container():
     items = [OrderItem("sheet", 1200.0, 800.0, 5.0, 9, "line 1")] * 2
     _, (one,) = OrderPacker((1200, 800, 100), 10).pack(items, keep_sequence=True)
     assert len(one.items) == 2
+
+
+def test_a_sheet_that_may_be_tipped():
+    """Its bin shows it on each side, so that it has three times as many cells as the container."""
+    OrderPacker((1500, 1500, 1800), 10, tipping=True).check([OrderItem("sheet", 1490.0, 1480.0, 300.0, 9, "line 1")])
+
+
+def test_an_order_whose_loads_would_fill_the_memory():
+    items = [OrderItem("pill", 20.0, 20.0, 20.0, 9, "line 1", max_load=9)] * 8_000
+    with pytest.raises(ValueError, match="^line 1: the order has 8,000 items, some with limits, of which 8,000 fit"):
+        OrderPacker((1200, 800, 1500), 20).check(items)
 
 
 @pytest.fixture

@@ -185,8 +185,11 @@ def test_what_is_no_image_of_the_tote_is_refused():
         Camera(500, 500, 160, 120, np.eye(4), SHAPE)
     with pytest.raises(ValueError, match="camera.pose: expected .4, 4."):
         Camera(500, 500, 160, 120, np.ones((4, 4)), SHAPE)
-    with pytest.raises(ValueError, match="camera.fx=0"):
-        Camera(0, 500, 160, 120, np.eye(4), SHAPE)
+    with pytest.raises(ValueError, match="camera.pose: expected .4, 4."):
+        Camera(500, 500, 160, 120, "abc", SHAPE)
+    for key, value in {"fx": 0, "fy": "500", "cx": float("nan"), "cy": None}.items():
+        with pytest.raises(ValueError, match=f"camera.{key}={value!r}: expected a number of pixels"):
+            Camera(**{"fx": 500, "fy": 500, "cx": 160, "cy": 120, key: value}, pose=np.eye(4), shape=SHAPE)
     with pytest.raises(DepthMapError, match="labels: got shape"):
         camera(BIN).items(image(camera(BIN), [], BIN), CELL, SIZE, labels=np.zeros((3, 3)))
     found = eye.tote_map(shown, CELL, SIZE)
@@ -206,6 +209,10 @@ def test_a_scene_of_two_images():
     assert Planner(CELL, planner="joint_dbl").plan(scene).status == "ok"
     with pytest.raises(ValueError, match="^clearance=0.004: a pixel shows 0.0024 m of the floor; expected at least 2 "):
         Scene.from_images(CELL, *views, SIZE, clearance=0.004)
+    for key, value in {"cell_size": 50, "accuracy": -0.003, "tote_height": 250, "greatest_height": 60}.items():
+        with pytest.raises(ValueError, match=f"^{key}={value}: expected metres") as caught:
+            Scene.from_images(CELL, *views, **{"cell_size": SIZE, key: value})
+        assert not isinstance(caught.value, DepthMapError)  # another image would not help
     with pytest.raises(DepthMapError, match="labels: got shape"):
         Scene.from_images(CELL, *views, SIZE, labels=np.zeros((3, 3)))
     with pytest.raises(DepthMapError, match="is no item of the given sizes"):

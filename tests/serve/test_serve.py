@@ -208,6 +208,7 @@ def test_health_says_no_more_of_a_reach_than_its_kind(tmp_path):
         (b"[" + b"[]," * 300_000 + b"1]", 400, "300,001 lists, rows of maps included; expected at most 2,030"),
         (b'{"tote_depth": [[5]], "tote_depth": [[5]]}', 400, "'tote_depth' stands twice"),
         ({**GRID, "deadline": 0}, 422, "deadline=0: expected seconds between 0.001 and 3600"),
+        ({**GRID, "exclude": {}}, 422, "exclude={}: expected"),
         ({**GRID, "exclude": [[1]]}, 422, "exclude[0]=[1]: expected numbers x, y or x, y, z"),
         (b" " * 2_884_000, 413, "2,883,872 bytes"),
     ],
