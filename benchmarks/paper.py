@@ -233,7 +233,7 @@ def found(rows: list[dict], **wanted) -> dict | None:
 
 
 def trained_rotations(rows: list[dict]) -> list[int]:
-    """Return each R with which the proposed network was trained."""
+    """Return the values of R for which the proposed network is measured."""
     return sorted({row["R"] for row in rows if row["method"] == "fcn4d"})
 
 

@@ -224,9 +224,7 @@ class OrderPacker:
         least = min(w * d * _oriented(item, face[0])[2] for item, face, (w, d, *_) in variants)
         most = min(len(items), int(length * width * self.container[2] / least + 1e-6))
         tries = 2 * len(SEQUENCES) * (1 + (len(self._faces) > 1))
-        words = (
-            f"{items[0].place}: the order has {len(items):,} items, some with limits, of which {most:,} fit by volume"
-        )
+        words = f"{items[0].place}: the order has {len(items):,} items, some with limits; {most:,} fit by volume"
         check_bytes(words, handling * 3 * tries * most**2)  # tables of the items below one another, while one is added
         return replace(
             cell, bin_items=len(self._faces), longest_side=max(wide, deep), handling=handling, most_items=most

@@ -183,3 +183,9 @@ def test_the_most_visited_action_is_played():
     search._nodes, search._walk_down = lambda *_: [root], lambda _: ([], True)
     reaching = actions_reaching(env.cell, placing_maps(env.cell, env.state), torch.tensor([often]))[0]
     assert search.decide(state).item() == reaching[reaching >= 0].min()
+
+
+def test_loads_that_would_fill_the_memory_are_refused():
+    env = PickPlaceEnv(num_envs=1, tote_size=(8, 8, 8), handling=True)
+    with pytest.raises(ValueError, match=r"^planner.simulations=5000 with loads: it would take 1\.\d+ GB"):
+        MCTS(env.cell, env.items)
