@@ -403,7 +403,7 @@ def test_what_needs_no_torch_does_not_wait_for_it(name, words, expected, smoke_r
 def test_help_names_the_purpose_and_the_options_of_each_group(run):
     code, out, err = run("train", "--config-dir", str(CURRICULA), "seed=3", "items=mixed", "--help")
     assert code == 0 and f"  items=mixed                      {GROUPS['items']}\n      boxes, cut1" in out, err
-    assert "adaptive, careful, learning_progress" in out and "  seed: 0    " in out
+    assert "adaptive, buffer, careful, learning_progress" in out and "  seed: 0    " in out
     assert GROUPS.keys() == {str(path.parent.relative_to(conf_dir())) for path in conf_dir().glob("*/**/*.yaml")}
     assert max(map(len, out.splitlines())) <= 120
 
