@@ -255,7 +255,8 @@ def box_of_map(heights: np.ndarray, side: float, accuracy: float, is_cell_map: b
     Raises:
         DepthMapError: for anything but one cuboid.
     """
-    where = np.argwhere(heights > least_height(accuracy))
+    is_item = heights > least_height(accuracy)
+    where = np.argwhere(is_item)
     corners = np.unique(np.concatenate([where + step for step in product((0, 1), repeat=2)]), axis=0)
     x, y, w, d, yaw = smallest_rectangle(corners * side)
     box = Box(x, y, w, d, float(heights.max()), yaw)
@@ -265,7 +266,26 @@ def box_of_map(heights: np.ndarray, side: float, accuracy: float, is_cell_map: b
     inside = is_inside(centres, (x, y), (w - 2 * border, d - 2 * border), yaw)
     expected = f"{box.h:g} m: one cuboid, {w:g} x {d:g} m with its centre at [{x:g}, {y:g}]{'' if name else LABEL_HINT}"
     refuse("bin_depth", inside & (heights < box.h - 2 * accuracy - ROUNDING), heights, f" m{name}", expected)
-    return box.upright()
+    return box.upright() if is_cell_map else replace(box, edge_error=_edge_error(is_item, side, box)).upright()
+
+
+def _edge_error(is_item: np.ndarray, side: float, box: Box) -> float:
+    """Return how far inside its measured sides a box begins that surely lies on the item; m.
+
+    Args:
+        is_item: whether a square of a map shows the item, which may only touch that square; bool ``[X, Y]``.
+        side: of a square, m.
+        box: the measured one.
+    """
+    # The item is convex: with the four squares at the corners of a square it covers that square.
+    padded = np.pad(is_item, 1)
+    covered = padded[:-2, :-2] & padded[:-2, 2:] & padded[2:, :-2] & padded[2:, 2:]
+    unsure, square = (np.argwhere(~covered) + 0.5) * side, rectangle(side, side, 0.0)
+    unsure, half = unsure[overlap_mask(unsure, square, box)], min(box.w, box.d) / 2
+    for error in np.arange(0.0, half, side / 4):
+        if not overlap_mask(unsure, square, replace(box, w=box.w - 2 * error, d=box.d - 2 * error)).any():
+            return float(error)
+    return half
 
 
 def smallest_rectangle(points: np.ndarray) -> tuple[float, float, float, float, float]:

@@ -11,7 +11,7 @@ from scenes import Gripper, World, fault, plan_for, random_scene, rectangle, squ
 
 from pickplace import CellSpec, DepthMapError, Planner
 from pickplace.robot import planner as robot_planner
-from pickplace.robot.measure import box_of_map
+from pickplace.robot.measure import box_of_map, is_inside
 from pickplace.robot.planner import Box
 from pickplace.rules.reach.base import Limits
 from pickplace.rules.support.rules import Hull
@@ -226,6 +226,24 @@ def test_an_item_is_read_from_a_fine_map():
         if abs(expected.yaw) > 10 and abs(expected.yaw) < 44:
             assert box.yaw == pytest.approx(expected.yaw, abs=2)
         assert sorted((box.w, box.d)) == pytest.approx([0.08, 0.12], abs=0.006)
+
+
+@pytest.mark.parametrize("shows", ["touched", "centre"])
+@pytest.mark.parametrize("side", [0.01, 0.004])
+def test_an_item_surely_fills_the_box_that_a_map_of_coarse_squares_shows(shows, side):
+    """Without its edge error; a square shows the item if it touches the square, or if it covers the square's middle."""
+    draw, fine = np.random.default_rng(4), 5
+    points = (np.indices((round(0.24 / side) * fine,) * 2).transpose(1, 2, 0) + 0.5) * side / fine
+    for yaw in (0.0, 1.0, 45.0, *draw.uniform(-45, 45, 20)):
+        item = Box(*draw.uniform(0.1, 0.14, 2), *draw.uniform(0.07, 0.12, 2), 0.06, yaw)
+        seen = is_inside(points, (item.x, item.y), (item.w, item.d), yaw).reshape(-1, fine, len(points) // fine, fine)
+        box = box_of_map(np.where(seen.any((1, 3)) if shows == "touched" else seen[:, 2, :, 2], 0.06, 0.0), side, 0.002)
+        sure = rectangle((box.x, box.y), np.array((box.w, box.d)) - 2 * box.edge_error, box.yaw)
+        assert is_inside(sure, (item.x, item.y), (item.w + 1e-9, item.d + 1e-9), yaw).all()
+        assert box.edge_error <= 3 * side
+        corners = rectangle((item.x, item.y), (item.w, item.d), yaw)
+        beyond = side / fine if shows == "touched" else side  # an item reaches past the points that show it
+        assert is_inside(corners, (box.x, box.y), (box.w + 2 * beyond, box.d + 2 * beyond), box.yaw).all()
 
 
 def test_two_items_that_are_seen_as_such_are_refused():
