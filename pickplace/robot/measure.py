@@ -262,7 +262,7 @@ def box_of_map(heights: np.ndarray, side: float, accuracy: float, is_cell_map: b
     box = Box(x, y, w, d, float(heights.max()), yaw)
     # All that lies well inside the rectangle must be the item's top.
     centres = (np.indices(heights.shape).transpose(1, 2, 0) + 0.5) * side
-    border = 0.0 if is_cell_map else 2 * side if yaw else side + PARALLEL_TOLERANCE * max(w, d)
+    border = 0.0 if is_cell_map else 2 * side + PARALLEL_TOLERANCE * max(w, d) * (yaw == 0)
     inside = is_inside(centres, (x, y), (w - 2 * border, d - 2 * border), yaw)
     expected = f"{box.h:g} m: one cuboid, {w:g} x {d:g} m with its centre at [{x:g}, {y:g}]{'' if name else LABEL_HINT}"
     refuse("bin_depth", inside & (heights < box.h - 2 * accuracy - ROUNDING), heights, f" m{name}", expected)

@@ -121,7 +121,7 @@ def test_every_curriculum_and_every_exchange_of_its_parts():
     longest = max(map(len, parts))
     for advance, sample, name in itertools.islice(zip(*map(itertools.cycle, parts), strict=True), longest):
         words = [f"+curriculum={name}", f"curriculum/advance={advance}", f"curriculum/sample={sample}"]
-        curriculum, cell = build("curriculum", composed(*words, name=None).curriculum), CellSpec(bin_items=10, preview=9)
-        curriculum.setup(cell, Kinds([(1, 1, 1)]), 10**9)
+        curriculum = build("curriculum", composed(*words, name=None).curriculum)
+        curriculum.setup(CellSpec(bin_items=10, preview=9), Kinds([(1, 1, 1)]), 10**9)
     for name in options("curriculum"):
         assert isinstance(build("curriculum", composed(f"+curriculum={name}", name=None).curriculum), Curriculum)

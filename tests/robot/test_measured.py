@@ -251,7 +251,7 @@ def test_two_items_that_are_seen_as_such_are_refused():
     heights[10:20, 10:20] = 0.06
     heights[22:30, 10:20] = 0.06
     planner = make_planner("joint_dbl")
-    with pytest.raises(DepthMapError, match=r"bin_depth\[20, 11\]: got 0 m, expected 0.06 m: one cuboid, 0.1 x 0.05 m"):
+    with pytest.raises(DepthMapError, match=r"bin_depth\[20, 12\]: got 0 m, expected 0.06 m: one cuboid, 0.1 x 0.05 m"):
         plan_for(planner, heights, np.full((6, 6), 0.25), cell_size=CELL)
     heights[20:22, 10:20] = 0.04  # a lower one between them
     with pytest.raises(DepthMapError, match="got 0.04 m, expected 0.06 m"):
