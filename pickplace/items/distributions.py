@@ -212,7 +212,7 @@ class Kinds(ItemDistribution):
             raise ValueError(f"items.kinds: got {excerpt(bad[0])}, expected (w, d, h) in positive whole cells.")
         weights = [1.0] * len(kinds) if weights is None else weights
         is_list = isinstance(weights, (list, tuple)) and len(weights) == len(kinds)
-        expect(is_list, "items.weights", weights, f"{len(kinds)} numbers, one for each kind")
+        expect(is_list, "items.weights", weights, f"{len(kinds)} numbers, one for each of items.kinds")
         good = all(is_number(v) and v >= 0 for v in weights) and is_number(total := sum(weights)) and total > 0
         expect(good, "items.weights", weights, "finite numbers >= 0 that are not all 0")
         self._listed, self._used = len(weights), [i for i, v in enumerate(weights) if v > 0]

@@ -7,7 +7,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 from scipy import ndimage
 
-from pickplace.common.validate import refuse_if
+from pickplace.common.validate import expect, refuse_if
 from pickplace.robot.box import Box, DepthMapError, HiddenBox, UnknownBox
 from pickplace.robot.depth_image import EIGHT_NEIGHBOURS, Heights, Room, distance_outside, level_range
 from pickplace.robot.measure import PARALLEL_TOLERANCE, is_inside, smallest_rectangle, turned_axes
@@ -23,7 +23,13 @@ MAX_HIDDEN_SHARE = 0.25  # greatest share of the bin's floor that holes may hide
 
 
 def find_boxes(
-    seen: Heights, room: Room, margin: float, accuracy: float, greatest: float, labels: np.ndarray | None, sizes
+    seen: Heights,
+    room: Room,
+    margin: float,
+    accuracy: float,
+    greatest: float,
+    labels: np.ndarray | None,
+    sizes: list[tuple[float, float, float]] | None,
 ) -> list[Box]:
     """Return the items in a bin, and an :class:`UnknownBox` for each place that may hold one; see :meth:`Camera.items`.
 
@@ -254,7 +260,18 @@ def _hidden_length(seen: Heights, box: Box, boxes: Sequence[Box]) -> float:
     return longest if longest > pixel / 2 else 0.0
 
 
-def _check_reading(box: Box, sizes, tolerance: float) -> None:
+def as_sizes(sizes) -> list[tuple[float, float, float]]:
+    """Return the sizes of items as triples ``(w, d, h)``, m; refuse what is none with a ``ValueError``."""
+    try:
+        array = np.asarray(sizes, dtype=float)
+    except (TypeError, ValueError):
+        array = np.empty(0)
+    good = array.ndim == 2 and array.shape[1] == 3 and len(array) and (np.isfinite(array) & (array > 0)).all()
+    expect(good, "sizes", sizes, "a list of (w, d, h), lengths above 0 in metres")
+    return [(w, d, h) for w, d, h in array.tolist()]
+
+
+def _check_reading(box: Box, sizes: list[tuple[float, float, float]], tolerance: float) -> None:
     """Refuse a box that could be two items of known sizes, or has no known size; the message names both readings."""
     tall = [(w, d) for a, b, h in sizes for w, d in {(a, b), (b, a)} if abs(box.h - h) <= tolerance]
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pickplace.common.validate import excerpt, is_number, refuse_if
-from pickplace.robot.bin_image import find_boxes
+from pickplace.robot.bin_image import as_sizes, find_boxes
 from pickplace.robot.box import ACCURACY, Box, DepthMapError
 from pickplace.robot.depth_image import Heights, Room, read_heights
 from pickplace.robot.measure import MAX_PATCHES, ToteMap
@@ -166,6 +166,7 @@ class Camera:
             bin_height: of the bin's walls, m; None: from ``cell.bin_size``.
 
         Raises:
+            ValueError: for sizes that are no lengths.
             DepthMapError: for an image that does not show the bin, a floor that is not where the camera's pose says,
                 something that is not one item, or if no item is seen well enough.
         """
@@ -179,6 +180,8 @@ class Camera:
                 f"{list(self.shape)} as of depth.",
                 DepthMapError,
             )
+        if sizes is not None:
+            sizes = as_sizes(sizes)
         seen = self._look(depth, room, accuracy)
         if labels is not None:
             row, column = seen.corner

@@ -213,6 +213,9 @@ def test_a_scene_of_two_images():
         with pytest.raises(ValueError, match=f"^{key}={value}: expected metres") as caught:
             Scene.from_images(CELL, *views, **{"cell_size": SIZE, key: value})
         assert not isinstance(caught.value, DepthMapError)  # another image would not help
+    for sizes in (0.1, (0.2, 0.2, 0.2), [], [(0.2, 0.2)], [(0.2, 0.2, 0.2), (0.1, 0.1)], [(0.2, 0.2, -0.2)], "200"):
+        with pytest.raises(ValueError, match=r"^sizes=.*: expected a list of \(w, d, h\), lengths above 0 in metres"):
+            Scene.from_images(CELL, *views, SIZE, sizes=sizes)
     with pytest.raises(DepthMapError, match="labels: got shape"):
         Scene.from_images(CELL, *views, SIZE, labels=np.zeros((3, 3)))
     with pytest.raises(DepthMapError, match="is no item of the given sizes"):
