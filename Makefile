@@ -78,7 +78,7 @@ mutations: $(STAMP)  ## change the code at 40 random places, and see whether the
 	$(BIN)/pip install --quiet --disable-pip-version-check 'cosmic-ray>=8.3,<9'
 	$(BIN)/python tests/long/mutations.py $(ARGS)
 
-bench: $(STAMP)  ## run the benchmarks on a quiet machine (half an hour), and write docs/performance.md
+bench: $(STAMP)  ## run the benchmarks on a quiet machine (up to an hour), and write docs/performance.md
 	$(BIN)/pip install --quiet --disable-pip-version-check 'jumanji>=1.1,<2' || echo "jumanji cannot be installed; its part is skipped"
 	for part in training environment decision answers report; do \
 		$(BIN)/python benchmarks/$$part.py || exit 1; \
