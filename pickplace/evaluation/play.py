@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torchrl.envs.utils import step_mdp
 
+from pickplace.common.machine import trim_memory
 from pickplace.common.validate import check_bytes, one_of, refuse_if, whole_number
 from pickplace.envs.checks import problem_bytes
 from pickplace.envs.torchrl import PickPlaceEnv
@@ -199,6 +200,7 @@ def play(
             action = decide(planner, batch.env.cell, batch.observation)
             batch.record(planner, action)
             batch.step(action)
+            trim_memory()
         parts.append(batch.results)
         recordings += batch.recordings.values()
     return Episodes(

@@ -17,7 +17,7 @@ from torchrl.envs import Compose, TransformedEnv
 from pickplace.algorithms.base import Algorithm, BatchPosition, Task
 from pickplace.algorithms.imitation import WarmStart, with_warm_start
 from pickplace.common.graphs import NO_COMPILE, CompileSettings
-from pickplace.common.machine import use_machine
+from pickplace.common.machine import trim_memory, use_machine
 from pickplace.common.validate import excerpt, expect, refuse_if
 from pickplace.config.registry import build
 from pickplace.envs.saved_state import check_saved_states
@@ -292,6 +292,7 @@ class Trainer:
     def finish_batch(self, metrics: dict, before: int) -> None:
         """Validate, log, save and print progress if their intervals ended between ``before`` and now."""
         cfg, frames = self.cfg, self.frames
+        trim_memory()
         callbacks.call(self.callbacks, "on_batch", self, metrics)
         interval = cfg.evaluation_interval or -(-cfg.total_frames // VALIDATIONS)
         if self.is_complete or has_passed(before, frames, interval):
