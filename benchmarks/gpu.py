@@ -28,7 +28,7 @@ from hydra import compose, initialize_config_dir
 from tensordict import TensorDict
 
 from pickplace.common.graphs import CompileSettings
-from pickplace.config.composition import conf_dir
+from pickplace.config.words import conf_dir
 from pickplace.planners.heuristics import RandomFeasible
 from pickplace.training.trainer import Trainer, training_env
 

@@ -14,7 +14,7 @@ from common import console_command, save, spread
 from hydra import compose, initialize_config_dir
 from torchrl.envs import TransformedEnv
 
-from pickplace.config.composition import conf_dir
+from pickplace.config.words import conf_dir
 from pickplace.policies.base import Policy
 from pickplace.policies.fcn4d.policy import Fcn4d
 from pickplace.policies.fcn_grasp.policy import FcnGrasp

@@ -18,8 +18,8 @@ from omegaconf import OmegaConf
 from tensordict import TensorDict
 
 from pickplace.algorithms.base import Task
-from pickplace.config.composition import conf_dir
 from pickplace.config.registry import build
+from pickplace.config.words import conf_dir
 from pickplace.evaluation import artifacts, command, evaluate
 from pickplace.rules.observation import STANDARD_TERMS
 from pickplace.runs import checkpoint

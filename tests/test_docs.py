@@ -17,8 +17,9 @@ from omegaconf import OmegaConf
 
 import pickplace
 from pickplace import Planner, Scene
-from pickplace.config.composition import compose_job, config_files
+from pickplace.config.composition import compose_job
 from pickplace.config.registry import build
+from pickplace.config.words import config_files
 from pickplace.evaluation import pack_command
 from pickplace.physics import command as physics
 from pickplace.policies import export

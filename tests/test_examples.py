@@ -22,8 +22,8 @@ from hydra import compose, initialize_config_dir
 
 from pickplace import Box, CellSpec, PickPlaceEnv, Planner, Scene, load_policy
 from pickplace.algorithms.base import BatchPosition, Task
-from pickplace.config.composition import conf_dir
 from pickplace.config.registry import build
+from pickplace.config.words import conf_dir
 from pickplace.items.distributions import Kinds
 from pickplace.items.order_file import OrderItem
 from pickplace.physics.plans import EpisodePlan, Placement

@@ -5,8 +5,8 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from pickplace.config.composition import conf_dir
 from pickplace.config.registry import build
+from pickplace.config.words import conf_dir
 from pickplace.planners.policy import PolicyPlanner
 from pickplace.policies.fcn4d.policy import Fcn4d, Typical
 from pickplace.policies.fcn_grasp.policy import FcnGrasp, UnmaskedFcnGrasp, fcn_grasp

@@ -12,49 +12,22 @@ from typing import Any, cast
 import hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
-from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
+from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from pickplace.common.errors import unknown_key
 from pickplace.common.validate import excerpt, refuse_any, refuse_if
 from pickplace.config.allowlist import walk
+from pickplace.config.own_values import own_values
 from pickplace.config.registry import REGISTRY, names_at
-
-#: Groups whose preset values stay when the command line chooses another option: in the first all values, in the second
-#: plain values under keys that the new option also has, such as ``algo.lr``.
-KEPT_GROUPS, SHARED_GROUPS = ("env", "evaluation"), ("algo", "model")
+from pickplace.config.words import conf_dir, config_files, group_options, line_of, package_of, parse, search_words
 
 #: Keys of Hydra that users of the commands set.
 HYDRA_KEYS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.searchpath", "hydra.verbose")
 
 #: Sweepers and launchers of Hydra that are optional extras.
 PLUGINS = ("optuna", "joblib", "submitit")
-
-
-def conf_dir() -> Path:
-    """Return the folder of the config files: inside the package in a wheel, beside it in a checkout."""
-    package, checkout = Path(__file__).resolve().parents[1:3]
-    return package / "conf" if (package / "conf").is_dir() else checkout / "conf"
-
-
-def config_files():
-    """Return a context in which :func:`hydra.compose` reads the files of ``conf/``."""
-    return hydra.initialize_config_dir(str(conf_dir()), version_base="1.3")
-
-
-def parse(words: Iterable[str]) -> list[Override]:
-    """Parse words of a command line into overrides; a ``ValueError`` names a word that is not an override."""
-    words = list(words)
-    try:
-        return OverridesParser.create().parse_overrides(words)
-    except (ValueError, TypeError) as error:  # such as a number of too many digits
-        raise ValueError(f"{' '.join(words)}: {error}.") from error
-    except OverrideParseException as error:
-        reasons = [line for line in error.message.splitlines() if not line.startswith(("Error parsing", "See https"))]
-        raise ValueError(f"{error.override!r}: expected <key>=<value> ({' '.join(reasons)}).") from error
 
 
 @cache
@@ -157,7 +130,7 @@ def _refuse_options_as_values(words: list[str]) -> None:
         place, value = override.key_or_group.replace("/", "."), override.value()
         for group in {place.replace(".", "/"), place.rpartition(".")[2]} - {override.key_or_group}:
             options = group_options(group, search) if isinstance(value, str) else []
-            if options and place in (own := group.replace("/", "."), f"{_package(group, options)}.{own}"):
+            if options and place in (own := group.replace("/", "."), f"{package_of(group, options)}.{own}"):
                 known = value if value in options else f"<one of {', '.join(options)}>"
                 raise ValueError(f"{override.key_or_group}={excerpt(value)}: expected {group}={known}.")
 
@@ -175,17 +148,12 @@ def known_names(cfg: DictConfig) -> list[str]:
     ]
 
 
-def group_options(group: str, search: Iterable[str] = ()) -> list[str]:
-    """Return the names of a group's options, with those in folders that overrides add to the search path."""
-    return GlobalHydra.instance().config_loader().get_group_options(group, overrides=list(search))
-
-
 def _first_of_sweep(words: list[str]) -> list[str]:
     """Return overrides with only the first of their values. Those whose values cannot be listed are left out."""
     first = []
     for override in parse(words):
         if not override.is_sweep_override():
-            first.append(_line(override))
+            first.append(line_of(override))
         elif override.is_discrete_sweep():
             first += [f"{override.get_key_element()}={value}" for value in islice(override.sweep_string_iterator(), 1)]
     return first
@@ -207,14 +175,9 @@ def clearer_error(error: HydraException, config_name: str, words: list[str]) -> 
             known = hydra.compose(config_name, _first_of_sweep(others), return_hydra_config=True)
         except (HydraException, OmegaConfBaseException, ValueError):  # others are wrong, too
             search = search_words(words)
-            choices = [_line(each) for each in parse(words) if group_options(each.key_or_group, search)]
+            choices = [line_of(each) for each in parse(words) if group_options(each.key_or_group, search)]
             known = hydra.compose(config_name, [*search, *_first_of_sweep(choices)], return_hydra_config=True)
     return ValueError(unknown_key(key[1], known, others=known_names(known)))
-
-
-def search_words(words: Iterable[str]) -> list[str]:
-    """Return the words of a command line that set the folders with config files."""
-    return [word for word in words if word.lstrip("+").startswith("hydra.searchpath=")]
 
 
 def refuse_unknown_keys(cfg: DictConfig, known: DictConfig, path: str = "") -> None:
@@ -231,103 +194,6 @@ def refuse_unknown_keys(cfg: DictConfig, known: DictConfig, path: str = "") -> N
             refuse_unknown_keys(node, known[key], f"{path}{key}.")
 
 
-def own_values(cfg: DictConfig) -> DictConfig:
-    """Return the config of this run without preset values that were meant for an option that another one replaced.
-
-    A preset, or a config file of the user, sets values for the option that it expects, such as
-    ``curriculum.advance.occupancy`` for ``threshold``. Hydra merges them into the option that the command line chose
-    instead. Here, an option that replaces another one gets the values of its own files and of the command line only.
-    :data:`KEPT_GROUPS` and :data:`SHARED_GROUPS` are exceptions.
-    """
-    running = HydraConfig.get()
-    search = search_words(running.overrides.hydra)
-    given = [(override, *_package_and_places(override, search)) for override in parse(task_overrides())]
-    choices = [(each, places) for each, package, places in given if package and not each.is_delete()]
-    pairs = [(place, choice) for choice, places in choices for place in places if place not in KEPT_GROUPS]
-    for place, choice in sorted(pairs, key=lambda pair: pair[0].count(".")):  # outer parts before inner ones
-        if OmegaConf.select(cfg, place) is None:
-            continue
-        words, others = [], []  # what is changed at that place, and the other choices
-        for each, package, places in given:
-            if each is choice:
-                continue
-            if any(_is_in(other, place) or (not package and _is_in(place, other)) for other in places):
-                words.append(_line(each, "" if package or each.is_delete() else "++"))
-            elif package:
-                others.append(_line(each))
-        try:
-            own = _part_at(hydra.compose(None, [*search, _line(choice, "+"), *words]), place)
-            before = hydra.compose(running.job.config_name, [*search, *others], return_hydra_config=True)
-        except ConfigCompositionException:  # an option that depends on those of other groups
-            continue
-        merged = _part_at(cfg, place)
-        if isinstance(choice.value(), list):  # of callbacks: those that are listed keep their values
-            cfg = cfg.copy()
-            OmegaConf.update(cfg, place, {key: merged[key] for key in own or ()}, merge=False, force_add=True)
-            continue
-        group = choice.get_key_element().lstrip("+~")  # as Hydra lists it, such as planner@warm_start.teacher
-        if str(before.hydra.runtime.choices.get(group)) != str(choice.value()):
-            cfg = cfg.copy()
-            if place in SHARED_GROUPS:
-                plain = [key for key in own if not isinstance(own[key], dict) and not isinstance(merged[key], dict)]
-                own |= {key: merged[key] for key in plain if key != "_target_"}
-            OmegaConf.update(cfg, place, own, merge=False, force_add=True)
-    return cfg
-
-
-def task_overrides(hydra_cfg: Any = None) -> list[str]:
-    """Return the words of the command line, with references unresolved: here they would lead elsewhere."""
-    return cast(list, OmegaConf.to_container((hydra_cfg or HydraConfig.get()).overrides.task, resolve=False))
-
-
-def places_in_other_groups(word: str) -> list[str]:
-    """Return the places in other groups that an option sets, such as ``["env.reach"]`` for ``reach=annulus``.
-
-    Raises:
-        ValueError: for an option that is removed (``~reach``), because nothing replaces it.
-    """
-    (override,) = parse([word])
-    group = override.key_or_group
-    package, places = _package_and_places(override, search_words(HydraConfig.get().overrides.hydra))
-    if package is None or override.package or package in ("_global_", group.replace("/", ".")):
-        return []
-    refuse_if(
-        override.is_delete(),
-        f"{word}: the checkpoint's {group} can be exchanged, not removed; expected {group}=<option>.",
-    )
-    return places
-
-
-def _package_and_places(override: Override, search: list[str]) -> tuple[str | None, list[str]]:
-    """Return the package, and the places in the config, that an override changes.
-
-    Returns:
-        The package of the group if the override chooses an option (``_global_`` for presets); None if it sets a value.
-        Then the changed places: for a value its key; for an option the group's package. If that is the package of
-        another group, the places are the option's keys in it.
-    """
-    group = override.key_or_group
-    options = group_options(group, search)
-    value: Any = override.value()  # options of callbacks are a list
-    if not options or isinstance(value, dict) or (isinstance(value, list) and not {*map(str, value)} <= {*options}):
-        return None, [group]
-    own = override.package or group.replace("/", ".")
-    package: Any = override.package or _package(group, options)
-    if package == "_global_" or override.value() is None:
-        return package, []
-    if package == own or override.is_delete():
-        return package, [own if package == own else f"{package}.{own}"]
-    part = _part_at(hydra.compose(None, [*search, _line(override, "+")]), package)
-    return package, [f"{package}.{key}" for key in part or ()]
-
-
-def _package(group: str, options: list[str]) -> str:
-    """Return the package of a group's options, which is the same for all, such as ``env`` for ``gripper``."""
-    sources, paths = GlobalHydra.instance().config_loader().get_sources(), [f"{group}/{name}" for name in options]
-    files = (source.load_config(path) for path in paths for source in sources if source.is_config(path))
-    return next((file.header for file in files), {}).get("package") or group.replace("/", ".")
-
-
 def use_whole_numbers(cfg: DictConfig) -> None:
     """Replace numbers such as 1e5, which Hydra and YAML read as floats, by whole numbers.
 
@@ -336,21 +202,6 @@ def use_whole_numbers(cfg: DictConfig) -> None:
     for path, value in walk(OmegaConf.to_container(cfg, resolve=False)):
         if isinstance(value, float) and value.is_integer() and 10 <= abs(value) < 2**53:
             reduce(getitem, path[:-1], cast(Any, cfg))[path[-1]] = int(value)
-
-
-def _is_in(place: str, outer: str) -> bool:
-    return f"{place}.".startswith(f"{outer}.")
-
-
-def _line(override: Override, prefix: str = "") -> str:
-    """Return an override as a word of the command line; a prefix replaces its own."""
-    line = str(override.input_line)
-    return f"{prefix}{line.lstrip('+')}" if prefix else line
-
-
-def _part_at(cfg: DictConfig, place: str) -> Any:
-    part = OmegaConf.select(cfg, place)
-    return OmegaConf.to_container(part, resolve=False) if OmegaConf.is_config(part) else part
 
 
 def apply_overrides(saved: DictConfig, overrides: list[str], groups: Any = None, instead: str = "") -> DictConfig:

@@ -5,7 +5,7 @@ from textwrap import fill, indent
 
 from omegaconf import DictConfig
 
-from pickplace.config.composition import conf_dir, group_options, search_words
+from pickplace.config.words import conf_dir, group_options, search_words
 
 #: Meaning of each config group, in one line.
 GROUPS = {

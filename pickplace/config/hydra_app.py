@@ -23,6 +23,8 @@ from pickplace.common.interrupts import import_quietly
 from pickplace.common.validate import refuse_any, refuse_if, reword_errors
 from pickplace.config import composition
 from pickplace.config.help import help_text
+from pickplace.config.own_values import own_values
+from pickplace.config.words import conf_dir, config_files, parse, task_overrides
 
 log = logging.getLogger(__name__)
 
@@ -73,7 +75,7 @@ class Command:
             words = [f"++{word}" if self._is_of_checkpoint(word, words) else word for word in words]
             if options.info or options.hydra_help or options.version or options.shell_completion:
                 return self._start(words, flags)
-            with composition.config_files():
+            with config_files():
                 merged, cfg = composition.compose_job(self.config_name, words)
                 if options.help:
                     return write_output(help_text(self.config_name, merged))
@@ -112,7 +114,7 @@ class Command:
     def _start(self, words: list[str], flags: list[str], app: Callable[[DictConfig], Any] = lambda cfg: None) -> None:
         sys.argv[1:] = [*words, *flags]
         with reword_errors(HydraException, lambda error: composition.clearer_error(error, self.config_name, words)):
-            hydra.main(version_base="1.3", config_path=str(composition.conf_dir()), config_name=self.config_name)(app)()
+            hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=self.config_name)(app)()
 
     def _run(self, merged: DictConfig, checked: DictConfig | None, words: list[str], flags: list[str]) -> None:
         """Run the task with a checked config, or without one for each job of a sweep. The folder must not be in use.
@@ -127,7 +129,7 @@ class Command:
             run_dir = Path(running.runtime.output_dir)
             try:
                 self.folders.refuse_for_job(run_dir)
-                cfg = checked or self._checked(composition.own_values(hydras))
+                cfg = checked or self._checked(own_values(hydras))
                 if running.output_subdir is not None and cfg != hydras:  # correct Hydra's note on its merge
                     OmegaConf.save(cfg, run_dir / running.output_subdir / "config.yaml")
                 return getattr(import_module(module), name)(cfg, run_dir)
@@ -214,7 +216,7 @@ def sweep_words(merged: DictConfig, words: list[str]) -> list[str]:
 
 def constant_keys(words: list[str]) -> list[str]:
     """Return the keys that have the same value in all runs of a sweep's command line, except the seed."""
-    constant = [each for each in composition.parse(words) if not (each.is_hydra_override() or each.is_sweep_override())]
+    constant = [each for each in parse(words) if not (each.is_hydra_override() or each.is_sweep_override())]
     return [key for each in constant if (key := each.get_key_element().lstrip("+~")) != "seed"]
 
 
@@ -237,7 +239,7 @@ def folder_name(overrides: list[str], constant: list[str]) -> str:
 def _run_name(_root_: DictConfig) -> str:
     """Return the name of the folder of a sweep's run; its number where a sampler may draw the same values twice."""
     cfg = _root_.hydra
-    name = folder_name(composition.task_overrides(cfg), list(cfg.job.config.override_dirname.exclude_keys))
+    name = folder_name(task_overrides(cfg), list(cfg.job.config.override_dirname.exclude_keys))
     return name if cfg.sweeper._target_.endswith(".BasicSweeper") else str(cfg.job.num)
 
 

@@ -4,8 +4,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from pickplace.common.validate import refuse_if
 from pickplace.config.allowlist import trusted_config
-from pickplace.config.composition import apply_overrides, places_in_other_groups, task_overrides
+from pickplace.config.composition import apply_overrides
 from pickplace.config.hydra_app import Command
+from pickplace.config.own_values import places_in_other_groups
+from pickplace.config.words import task_overrides
 from pickplace.runs import folder
 from pickplace.runs.locate import locate, read_facts
 

@@ -4,13 +4,13 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from pickplace.common.validate import check_bytes, refuse_if, reword_errors, whole_number
+from pickplace.common.validate import check_bytes, refuse_if, reword_errors, size_tuple, whole_number
 from pickplace.config.registry import find, names_at
 from pickplace.items.order_file import ORIENTATIONS, TURNS, OrderItem
 from pickplace.planners.base import MapPlanner
@@ -117,6 +117,7 @@ class OrderPacker:
         tipping: bool = False,
     ):
         whole_number("cell", cell, most=MAX_CELL)
+        container = cast(tuple[int, int, int], size_tuple("container", container, 3, 10**6))
         self._faces = FACES if tipping else FACES[:1]
         self.container, self.cell_mm, size = container, cell, "x".join(map(str, container))
         refuse_if(min(container[:2]) < cell, f"container={size}: expected a length and a width of at least {cell} mm.")
@@ -203,6 +204,7 @@ class OrderPacker:
         )
 
     def _cell_for(self, items: Sequence[OrderItem]) -> CellSpec:
+        refuse_if(not items, "items: the order has none; expected at least one.")
         if misfits := [item for item in items if not self._variants(item, self._faces)]:
             raise ValueError(self._misfit(misfits))
         variants = [(item, *each) for item in items for each in self._variants(item, self._faces)]

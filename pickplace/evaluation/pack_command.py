@@ -88,7 +88,7 @@ def run(args: argparse.Namespace) -> None:
     packer = OrderPacker(container, args.cell, args.planner, args.tipping)
     for order in orders:  # before the first of them is packed
         packer.check(order.items)
-    folder, rows, recorded = Path(args.out), [], []
+    folder, rows, recorded, tables = Path(args.out), [], [], []
     folder.mkdir(parents=True, exist_ok=True)
     bed_bpp: dict[str, list[dict]] = {}
     plans: list[EpisodePlan] = []
@@ -101,7 +101,7 @@ def run(args: argparse.Namespace) -> None:
                 table = [
                     {**row, "orientation": packed.orientation} for row, packed in zip(table, each.items, strict=True)
                 ]
-            write_output(_text(name, place, len(containers), each, table))
+            tables.append(_text(name, place, len(containers), each, table))
             rows += table
             bed_bpp[key] = [_as_bed_bpp(packed) for packed in each.items]
             plans.append(_as_plan(len(plans), container, each))
@@ -119,7 +119,8 @@ def run(args: argparse.Namespace) -> None:
     for old in [path for path in earlier if path.name not in files]:
         old.unlink()
     shown = " to ".join(dict.fromkeys((files[0], files[-1])))
-    write_output(f"{folder}: plan.csv, plan.json, {PLANS}, {shown}\n")
+    # After the files: a reader that ends early, such as head, must not cost the plan.
+    write_output("".join([*tables, f"{folder}: plan.csv, plan.json, {PLANS}, {shown}\n"]))
 
 
 def _free_names(name: str, count: int, taken: Container[str]) -> tuple[str, list[str]]:

@@ -175,7 +175,7 @@ def read_orders(path, unit: str = "mm", key: str = "items.path", target: str | N
         refuse_if(
             item.id and item.kind != known.kind,
             f"{item.place}: item {excerpt(item.id)} is {_words(item)}, but {_words(known)} in {known.place}; "
-            "expected one size and weight for each id.",
+            "expected one size, weight and limits for each id.",
         )
         refuse_above(f"{path}:", total := total + quantity, "items", MAX_ITEMS)
         goal = _name(item.place, row, columns[header], "target")
@@ -259,7 +259,12 @@ def _read_header(place: str, header: Sequence, unit: str, decimal: str) -> dict[
         refuse_if(known and name in found, f"{place}: two columns {excerpt(name)}; expected one.")
         words = re.sub(r"[^a-z0-9]+", "_", name).strip("_") + "_"
         for column in OPTIONAL if not known else ():
-            if any(words.startswith(f"{each}_") for each in NAMES[column]):
+            # Long names also without separators, such as MaxLoad.
+            joined = words.replace("_", "")
+            if any(
+                words.startswith(f"{each}_") or (len(each) > 5 and joined.startswith(each.replace("_", "")))
+                for each in NAMES[column]
+            ):
                 similar[column] = key
         found[name] = key, suffix
     # In l,w,h and length,width,height the width is the second side; in w,d,h and width,depth,height the first.

@@ -23,7 +23,8 @@ from pickplace.common.validate import (
     whole_number,
 )
 from pickplace.config.allowlist import modules_to_trust, own_modules, saved_form, trusted_config
-from pickplace.config.composition import apply_overrides, compose_plain, parse, refuse_unknown_keys
+from pickplace.config.composition import apply_overrides, compose_plain, refuse_unknown_keys
+from pickplace.config.words import parse
 from pickplace.runs.folder import refuse_occupied, refuse_training
 from pickplace.runs.locate import CheckpointError, locate, read_facts
 

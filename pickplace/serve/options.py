@@ -155,8 +155,8 @@ def read_part(key: str, name: str):
     Raises:
         ValueError: naming the file, or the key in it.
     """
-    from pickplace.config.composition import conf_dir
     from pickplace.config.registry import build
+    from pickplace.config.words import conf_dir
 
     options = {path.stem: path for path in sorted((conf_dir() / key).glob("*.yaml"))}
     expected = f"expected {', '.join(options)}, or a file with the key {key}, such as conf/{key}/{[*options][0]}.yaml."

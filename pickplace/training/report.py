@@ -54,6 +54,9 @@ def write_report(
     ordered = sorted(episodes.recordings, key=lambda recording: -recording.occupancy)
     draw_scene(ordered[0], cell, item_colours(ordered[0].boxes)).savefig(tote, dpi=100)
     mix = failure_mix(rows)
+    # A rule that draws each episode's level has reached those that were played.
+    reached = played_levels(rows) if curriculum.weights else []
+    reached = reached or [int(row["curriculum/level"]) for row in rows]
     policy, sizes = str(cfg.model.actor._target_).rpartition(".")[2], "x".join(map(str, cell.tote_size))
     command = shlex.join(["pickplace-train", *noted_command(run_dir)])
     if changed := changed_values(run_dir, cfg):
@@ -62,7 +65,7 @@ def write_report(
         (f"{best:.4f}", f"best validation{after} (checkpoints/best)"),
         (f"{episodes.occupancy.mean():.4f}", f"last validation, {len(episodes.occupancy)} episodes of the full task"),
         (f"{episodes.occupancy.min():.4f}", "its worst episode"),
-        (f"{max(int(row['curriculum/level']) for row in rows)} of {curriculum.end}", f"highest {level_name} reached"),
+        (f"{max(reached)} of {curriculum.end}", f"highest {level_name} reached"),
     ]
     replay = f"{cfg.evaluation.stream} stream, seed {cfg.evaluation.seed}"
     parts = {

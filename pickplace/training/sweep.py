@@ -40,6 +40,7 @@ class SweepRun:
     status: str = "stopped"  # or finished, running, failed, unreadable
     frames: int = 0  # environment steps trained
     validations: list[dict[str, float]] = field(default_factory=list)  # rows of metrics.csv with a validation
+    best: float | None = None  # greatest occupancy of a validation
     seed: str = "0"  # as on the command line
     ended: str = ""  # why a callback ended a finished run before its budget was spent
     error: str = ""  # of a failed or unreadable run, in one sentence
@@ -76,6 +77,8 @@ def read_run(folder: Path) -> SweepRun:
             rows = [{"frames": facts["frames"], **latest}] if facts else []
         run.frames = int(rows[-1]["frames"]) if rows else 0
         run.validations = [row for row in rows if "eval/occupancy" in row]
+        best = [float(facts["best"])] if "best" in facts else []
+        run.best = max(best + [row["eval/occupancy"] for row in run.validations]) if run.validations else None
         # The checkpoint's config first: a resumed run may have a larger budget.
         config = facts.get("config") or read_note(folder, "config.yaml")
         config = config if isinstance(config, dict) else {}
@@ -179,7 +182,7 @@ def summarize(folder: Path) -> list[SweepSetting]:
         + ["frames", "best_occupancy", "final_occupancy", "final_ci95_low", "final_ci95_high", "ended", "error"],
         [
             [run.name, run.status, *map(run.overrides.get, keys), run.frames]
-            + [max((row["eval/occupancy"] for row in run.validations), default=None)]
+            + [run.best]
             + [*map(run.last.get, ("eval/occupancy", "eval/ci95_low", "eval/ci95_high")), run.ended, run.error]
             for run in runs
         ],

@@ -12,8 +12,9 @@ from omegaconf import OmegaConf
 
 import pickplace
 from pickplace.common.errors import full_names, sentence
-from pickplace.config.composition import apply_overrides, compose_plain, compose_training, conf_dir, known_names
+from pickplace.config.composition import apply_overrides, compose_plain, compose_training, known_names
 from pickplace.config.help import GROUPS
+from pickplace.config.words import conf_dir
 from pickplace.evaluation import evaluate
 from pickplace.evaluation.evaluate import prepare
 from pickplace.runs.folder import noted_command
@@ -201,6 +202,19 @@ OWN_VALUES = [
 ]
 
 
+GOPT, CUT = {"env.tote_size": [10, 10, 10], "env.bin_size": [5, 5, 1], "env.gripper.size": [1, 1]}, "items.drawn.order"
+OF_BENCHMARKS = [
+    ("experiment=mixed benchmark=gopt_rs", GOPT | {"items.width": [1, 5], "env.support": "half_or_hull"}),
+    ("experiment=warehouse benchmark=gopt_rs", GOPT | {"env.height_unit": 1.0, "env.num_envs": 64}),
+    ("experiment=mixed benchmark=cut1", GOPT | {CUT: "z", "items.width": None, "env.rotations": 1}),
+    ("experiment=mixed_grasp benchmark=cut1 items.drawn.order=stacking", {CUT: "stacking", "env.rotations": 1}),
+    ("experiment=mixed benchmark=gopt_rs items=kinds", GOPT | {"items.width": None, "items._target_": "kinds"}),
+    ("experiment=mixed benchmark=gopt_rs env.tote_size=[8,8,9] items.width=[1,3] gripper=plate_3x3",
+     {"env.tote_size": [8, 8, 9], "items.width": [1, 3], "items.depth": [1, 5], "env.gripper.size": [3, 3]}),
+    ("experiment=buffer benchmark=cut1", {"env.bin_size": [20, 20, 1], "env.bin_items": 10, CUT: "z"}),
+]  # fmt: skip
+
+
 @pytest.fixture
 def search(tmp_path):
     """Returns the override that adds folders with config files of the user's."""
@@ -212,7 +226,7 @@ def search(tmp_path):
     return f"hydra.searchpath=[file://{tmp_path}/conf,file://{CURRICULA}]"
 
 
-@pytest.mark.parametrize(("words", "expected"), OWN_VALUES)
+@pytest.mark.parametrize(("words", "expected"), OWN_VALUES + OF_BENCHMARKS)
 def test_an_option_chosen_on_the_command_line_has_its_own_values(run, search, words, expected):
     code, out, err = run("train", search, *words.split(), "--cfg", "job")
     assert code == 0, err

@@ -7,8 +7,8 @@ from commands import composed, options
 from omegaconf import OmegaConf
 
 from pickplace import CellSpec, PickPlaceEnv
-from pickplace.config.composition import conf_dir
 from pickplace.config.registry import REGISTRY, accepted_arguments, build, find, names_at
+from pickplace.config.words import conf_dir
 from pickplace.items.distributions import ItemDistribution, Kinds
 from pickplace.training.curriculum.curriculum import Curriculum
 

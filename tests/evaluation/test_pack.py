@@ -17,6 +17,7 @@ from omegaconf import OmegaConf
 from scipy.spatial import ConvexHull
 
 from pickplace.common.validate import refuse_if
+from pickplace.evaluation import pack_command
 from pickplace.evaluation.pack import OrderPacker
 from pickplace.items.order_file import ORIENTATIONS, OrderItem
 from pickplace.physics.engine import build_engine
@@ -273,6 +274,22 @@ def test_all_orders_are_packed_before_the_first_file_and_old_pages_go(pack, tmp_
 def test_the_rule_that_picks_first_packs_an_item_that_fits_tipped_only(pack, tmp_path):
     (path := tmp_path / "a.csv").write_text("l,w,h,kg\n60,80,200,1\n60,80,40,1\n")
     pack(path, "--container", "250x250x150", "--tipping", "--planner", "individual_heuristic")
+
+
+def test_a_reader_that_ends_early_costs_no_plan(pack, tmp_path, monkeypatch):
+    (path := tmp_path / "a.csv").write_text("order,l,w,h,kg\n1,10,20,30,1\n2,10,20,30,1\n", encoding="utf-8")
+    written = []
+    monkeypatch.setattr(pack_command, "write_output", lambda text: written.append([*tmp_path.rglob("plan.csv")]))
+    pack(path, "--container", "300x300x250")
+    assert all(map(len, written)) and len(written) == 1
+
+
+def test_bad_arguments_in_python_are_named():
+    for container in ((300, 300), (300.5, 300, 250), "300"):
+        with pytest.raises(ValueError, match="^container=.*: expected 3 whole numbers"):
+            OrderPacker(container)
+    with pytest.raises(ValueError, match="^items: the order has none; expected at least one"):
+        OrderPacker((300, 300, 250)).pack([])
 
 
 def test_a_name_that_the_terminal_cannot_show_loses_nothing(pack, tmp_path, monkeypatch):

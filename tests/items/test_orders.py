@@ -123,6 +123,7 @@ def test_streams_share_no_order_and_play_each_once(tmp_path_factory, orders, siz
 @pytest.mark.parametrize(("header", "message"), [
     ("max_load/lb", "the column 'max_load/lb' is not known; expected max_load in g or kg."),
     ("Max. load (t)", "the column 'Max. load \\(t\\)' is not known; expected max_load in g or kg."),
+    ("MaxLoad", "the column 'MaxLoad' is not known; expected max_load in g or kg."),
     ("Stackable?", "the column 'Stackable\\?' is not known; expected stackable."),
     ("Quantity (pcs)", "the column 'Quantity \\(pcs\\)' is not known; expected quantity."),
     ("orientations allowed", "expected orientations."), ("qty per line", "expected quantity."),

@@ -59,6 +59,9 @@ SCRIPTS = {
          [1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3]),
     "threshold: demotes, but not below the start":
         (Threshold(0.8, 4, demote_below=0.3), {}, each(4, 0.9, 0.9, 0.3, 0.29, 0.29, 0.29, 0.9), [2, 3, 3, 2, 1, 1, 2]),
+    "threshold: demotes from the last level after its most frames":
+        (Threshold(0.8, 2, 30, demote_below=0.3), {"high": 2},
+         [(10, [0.5] * 2), (40, [0.5] * 2), (80, [0.5] * 2), (120, [0.1] * 2), (125, [0.5] * 2)], [1, 2, 2, 1, 1]),
     "threshold: demotes by a full window only":
         (Threshold(0.8, 4, demote_below=0.3), {}, [(10, [0.9] * 4), (20, [0.0] * 3), (30, [0.0])], [2, 2, 1]),
     "plateau: after windows without improvement":  # best: 0.3, 0.5, -, 0.62 (0.5 + 0.12), -, -

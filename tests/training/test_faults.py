@@ -22,7 +22,7 @@ from torchrl.envs import TransformedEnv
 
 from pickplace import PickPlaceEnv, Planner
 from pickplace.common.errors import WorkerDied
-from pickplace.config.composition import conf_dir
+from pickplace.config.words import conf_dir
 from pickplace.evaluation.command import main as evaluate_main
 from pickplace.runs import checkpoint
 from pickplace.training import collectors

@@ -15,8 +15,8 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from pickplace.config.composition import config_files
 from pickplace.config.hydra_app import constant_keys, folder_name, sweep_words
+from pickplace.config.words import config_files
 from pickplace.runs import checkpoint
 from pickplace.runs.folder import FAILURE
 from pickplace.training import sweep

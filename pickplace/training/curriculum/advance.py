@@ -150,7 +150,8 @@ class Threshold(Advance):
 
     def update(self, tally):
         full = len(tally.window) == self.window
-        up = full and tally.mean >= self.occupancy - TOLERANCE or tally.level_frames >= self.max_frames
+        up = full and tally.mean >= self.occupancy - TOLERANCE
+        up |= tally.level_frames >= self.max_frames and tally.level < self.end  # from the last it may still go down
         down = full and tally.mean < self.demote_below - TOLERANCE and not up
         return tally.level + up - down, {}
 

@@ -1,7 +1,8 @@
 """Samplers: the levels of new episodes, given the level that the advance rule has reached.
 
 A sampler is called as ``sampler(level, first, count)``, with the number of the first level, and returns level numbers,
-int64 ``[count]``. Levels that differ in the tote's height alone are numbered by their heights.
+int64 ``[count]``, one for each problem. Only problems that begin an episode use theirs, so each is drawn independently.
+Levels that differ in the tote's height alone are numbered by their heights.
 """
 
 import torch
