@@ -28,6 +28,25 @@ for _ in range(20):
 print(max(faults[10:]))
 """
 
+TRIM = """
+import torch
+from pathlib import Path
+from pickplace.common import machine
+
+def resident():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+
+machine.keep_memory()
+large, small = zip(*[(torch.ones(2**18), torch.ones(8)) for _ in range(300)])  # small ones between hold the heap
+del large
+kept = resident()
+machine.trim_memory()
+assert resident() > kept - 2**20  # little enough
+machine.KEPT_BYTES = 0
+machine.trim_memory()
+print(kept - resident())
+"""
+
 
 @pytest.fixture
 def threads():
@@ -65,3 +84,9 @@ def test_memory_that_was_freed_is_used_again():
     """
     out = subprocess.run([sys.executable, "-c", FAULTS], capture_output=True, text=True, check=True)
     assert int(out.stdout) < 1_000
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="of glibc")
+def test_much_freed_memory_is_returned():
+    out = subprocess.run([sys.executable, "-c", TRIM], capture_output=True, text=True, check=True)
+    assert int(out.stdout) > 200 * 2**20
