@@ -77,6 +77,7 @@ def _of_benchmark(cfg: DictConfig, given: list[tuple], search: list[str]) -> Dic
     cfg = cfg.copy()
     for place in ["items", *(f"env.{key}" for key in own.env)]:
         value = part_at(own, place)
+        # A benchmark's lengths are in its own units, even where these are the usual ones.
         is_own = value != part_at(plain, place) or place in ("env.height_unit", "env.cell_size")
         if not is_own or any(_is_in(place, other) for other in places):
             continue

@@ -58,6 +58,7 @@ def line_of(override: Override, prefix: str = "") -> str:
 
 
 def part_at(cfg: DictConfig, place: str) -> Any:
+    """Return the value at a place of a config, or None; a node as a dict or list, with references unresolved."""
     part = OmegaConf.select(cfg, place)
     return OmegaConf.to_container(part, resolve=False) if OmegaConf.is_config(part) else part
 

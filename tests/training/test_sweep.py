@@ -252,9 +252,10 @@ def test_a_run_without_metrics_is_known_by_its_checkpoint(smoke_run, tmp_path):
     found = read_run(tmp_path / "0")
     assert (found.status, found.frames) == ("finished", 512)
     assert found.last["eval/occupancy"] == facts["latest"]["occupancy"]
-    facts["config"]["total_frames"] = 4096
+    facts["config"]["total_frames"], facts["best"] = 4096, 0.97
     checkpoint.write(tmp_path / "0/checkpoints/last", state, facts)
-    assert read_run(tmp_path / "0").status == "stopped"
+    found = read_run(tmp_path / "0")
+    assert (found.status, found.best) == ("stopped", 0.97)  # not the latest, which is worse
 
 
 def test_a_run_that_fails_leaves_the_others_alone(run, tmp_path, no_report):
