@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import product
 from typing import Any, TypeAlias, cast
 
@@ -12,20 +12,22 @@ from torch import Tensor
 
 from pickplace.common.validate import check_bytes, refuse_if, reword_errors, size_tuple, whole_number
 from pickplace.config.registry import find, names_at
+from pickplace.evaluation.filling import Filling, Numbered, PackedContainer, oriented
 from pickplace.items.order_file import ORIENTATIONS, TURNS, OrderItem
 from pickplace.planners.base import MapPlanner
+from pickplace.rules.bin import take_item
 from pickplace.rules.cell import MAX_CELLS, MAX_SIDE, POSES, CellSpec
+from pickplace.rules.grasps import carry
 from pickplace.rules.gripper.rules import Overlap
 from pickplace.rules.item import NO_LIMIT, Item
 from pickplace.rules.maps import NEVER
-from pickplace.rules.masks import placing_maps
+from pickplace.rules.masks import PlacingMaps, placing_maps
 from pickplace.rules.pile import Pile
-from pickplace.rules.state import EMPTY, Failure, State, surface_from
+from pickplace.rules.state import EMPTY, State, surface_from
 from pickplace.rules.step import apply
 from pickplace.rules.support.rules import RoundedUp
-from pickplace.views.recording import Move, Recording, record_moves
+from pickplace.views.recording import Recording, record_moves
 
-Numbered: TypeAlias = list[tuple[int, OrderItem]]  # items with their numbers in the order
 Faces: TypeAlias = Sequence[tuple[str, str]]  # the orientations of each face, as it lies and turned by 90 degrees
 Variant: TypeAlias = tuple[tuple[str, str], list[int]]  # an item on one of its faces, as a row of a table of items
 
@@ -43,44 +45,6 @@ SEQUENCES: tuple[Callable[[OrderItem], float], ...] = (
     lambda item: -item.length * item.width * item.height,
     lambda item: -item.height,
 )
-
-
-@dataclass(frozen=True)
-class PackedItem:
-    """An item at its place; millimetres from the container's corner."""
-
-    item: OrderItem
-    number: int  #: of the item in its order, from 1
-    corner: tuple[int, int, float]  #: least x, y and z
-    orientation: str  #: its sides along x, y and z, one of :data:`~pickplace.items.order_file.ORIENTATIONS`
-
-    @property
-    def turned(self) -> bool:
-        """Whether it is turned by 90 degrees about z, after any tipping."""
-        return ORIENTATIONS.index(self.orientation) % 2 == 1
-
-    @property
-    def size(self) -> tuple[float, float, float]:
-        """Sides along x, y and z, mm."""
-        return _oriented(self.item, self.orientation)
-
-
-@dataclass(frozen=True)
-class PackedContainer:
-    """One container with its items, in the sequence in which they are put down."""
-
-    items: list[PackedItem]
-    recording: Recording  #: for the replay page
-
-    @property
-    def occupancy(self) -> float:
-        """Share of its volume that the items fill."""
-        return self.recording.occupancy
-
-    @property
-    def top(self) -> float:
-        """Height of the highest item, mm."""
-        return max((packed.corner[2] + packed.size[2] for packed in self.items), default=0.0)
 
 
 class PackingCell(CellSpec):
@@ -180,11 +144,11 @@ class OrderPacker:
         variants: list[Variant] = []
         known: set[tuple[float, float, float]] = set()
         for face in faces:
-            w, d = (max(1, math.ceil(side / self.cell_mm - 1e-6)) for side in _oriented(item, face[0])[:2])
-            h = max(1, math.ceil(_oriented(item, face[0])[2] - 1e-6))
+            w, d = (max(1, math.ceil(side / self.cell_mm - 1e-6)) for side in oriented(item, face[0])[:2])
+            h = max(1, math.ceil(oriented(item, face[0])[2] - 1e-6))
             fits = (w <= wide and d <= deep), (w <= deep and d <= wide)
             allowed = [name for name, fit in zip(face, fits, strict=True) if fit and name in item.orientations]
-            new = {_oriented(item, name) for name in allowed} - known
+            new = {oriented(item, name) for name in allowed} - known
             if h <= self.container[2] and new:
                 turns = sum(TURNS[FACES[0][face.index(name)]] for name in allowed)
                 variants.append((face, [w, d, h, -1, turns, item.grams, item.max_load]))
@@ -211,7 +175,7 @@ class OrderPacker:
         sides = [columns[:3] for _, _, columns in variants]
         # An item's true centre may be this much nearer to the edge of its support than the centre of its cells.
         lost = max(
-            math.dist([side * self.cell_mm for side in columns[:2]], _oriented(item, face[0])[:2]) / 2
+            math.dist([side * self.cell_mm for side in columns[:2]], oriented(item, face[0])[:2]) / 2
             for item, face, columns in variants
         )
         wide, deep, high = (max(part) for part in zip(*sides, strict=True))
@@ -223,7 +187,7 @@ class OrderPacker:
                 support=support, bin_size=bins, tote_size=(length, width, self.container[2]), **self._settings
             )
         handling = any(item.has_limits for item in items)
-        least = min(w * d * _oriented(item, face[0])[2] for item, face, (w, d, *_) in variants)
+        least = min(w * d * oriented(item, face[0])[2] for item, face, (w, d, *_) in variants)
         most = min(len(items), int(length * width * self.container[2] / least + 1e-6))
         tries = 2 * len(SEQUENCES) * (1 + (len(self._faces) > 1))
         words = f"{items[0].place}: the order has {len(items):,} items, some with limits; {most:,} fit by volume"
@@ -243,7 +207,8 @@ class OrderPacker:
         Args:
             tries: the same items in a sequence, and the orientations of the faces on which they may lie.
         """
-        fills = [_Filling(Recording(number, cell.tote_size[2]), np.zeros(cell.tote_size[:2])) for _ in tries]
+        recordings = (Recording(number, cell.tote_size[2]) for _ in tries)
+        fills = [Filling(each, self.cell_mm, np.zeros(cell.tote_size[:2])) for each in recordings]
         surface = torch.full((len(tries), *cell.tote_size[:2]), EMPTY, dtype=torch.int32)
         height = torch.full((len(tries),), cell.tote_size[2])
         pile = Pile.empty(len(tries), cell.tote_size, cell.pile_room) if cell.handling else None
@@ -251,71 +216,30 @@ class OrderPacker:
             variants = [self._variants(item, faces) for (_, item), (_, faces) in zip(items, tries, strict=True)]
             state = State(surface, height, _in_bins(cell, variants), pile=pile)
             maps = placing_maps(cell, state)
+            on_one = _allow_places_on_one(fills, items, variants, state, maps)
             if (maps.top == NEVER).all():
                 for fill, each in zip(fills, items, strict=True):
                     fill.left.append(each)
                 continue
-            step = apply(cell, state, action := planner.choose(cell, state, maps, {}))
-            after, pile = state._replace(surface=step.surface), step.pile
+            action = planner.choose(cell, state, maps, {})
+            alone = _is_at(cell, state, action, on_one)[:, None, None]
+            step = apply(cell, state._replace(surface=torch.where(alone, surface | 1, surface)), action)
+            same = step.surface >> 1 == surface >> 1
+            after, pile = state._replace(surface=torch.where(same, surface, step.surface)), step.pile
             heights, bearing = after.heights, after.bearing
             for row, move in enumerate(record_moves(cell, None, None, state, action, step)):
                 if move.failure:
                     fills[row].left.append(items[row])
                     continue
                 face = variants[row][int(step.taken[row])][0]
-                self._put_down(fills[row], items[row], face[move.rotation % 2], move, heights[row], bearing[row])
+                fills[row].put_down(items[row], face[move.rotation % 2], move, heights[row], bearing[row])
             surface = surface_from(heights, bearing)
-        return [self._closed(fill) for fill in fills]
-
-    def _put_down(
-        self, fill: "_Filling", numbered: tuple[int, OrderItem], orientation: str, move: Move, heights: Tensor,
-        bearing: Tensor,
-    ) -> None:  # fmt: skip
-        """Add an item to a container; correct the heights of its cells, and whether they bear weight, in place.
-
-        Args:
-            numbered: the item with its number in the order.
-            heights: int32 ``[W_T, D_T]``, after the move.
-            bearing: bool ``[W_T, D_T]``.
-        """
-        (number, item), (x, y, w, d) = numbered, move.footprint
-        below = float(fill.tops[x : x + w, y : y + d].max())
-        packed = PackedItem(item, number, (x * self.cell_mm, y * self.cell_mm, round(below, 6)), orientation)
-        fill.recording.moves.append(_alone(move))
-        fill.items.append(packed)
-        fill.tops[x : x + w, y : y + d] = below + packed.size[2]
-        # A top is rounded up once, not with each item of its pile: so level tops are level within a millimetre.
-        heights[x : x + w, y : y + d] = math.ceil(below + packed.size[2] - 1e-6)
-        # An item bears nothing on a last cell that it does not fill. Where such cells support it, its true support ends
-        # up to a cell earlier than on the grid. So any other cell then bears only if the cell after it does, too.
-        part = bearing[x : x + w, y : y + d]
-        unfilled = [axis for axis, count in enumerate((w, d)) if packed.size[axis] < count * self.cell_mm - 1e-6]
-        for axis in [axis for axis in unfilled if part.select(axis, part.shape[axis] - 1).any()]:
-            count = part.shape[axis] - 1
-            part.narrow(axis, 0, count).logical_and_(part.narrow(axis, 1, count).clone())
-        for axis in unfilled:
-            part.select(axis, part.shape[axis] - 1).fill_(False)
-
-    def _closed(self, fill: "_Filling") -> tuple[PackedContainer, Numbered]:
-        """Return a container that gets no more items, and those that found no place in it."""
-        fill.recording.ending = Failure.STUCK if fill.left else Failure.NONE
-        fill.recording.occupancy = sum(math.prod(each.size) for each in fill.items) / math.prod(self.container)
-        return PackedContainer(fill.items, fill.recording), fill.left
+        return [fill.closed(math.prod(self.container)) for fill in fills]
 
 
 def _packs(planner: Any) -> bool:
     """Return whether a class of planners chooses among places, and needs nothing but the cell."""
     return isinstance(planner, type) and issubclass(planner, MapPlanner) and not hasattr(planner, "needs")
-
-
-@dataclass
-class _Filling:
-    """A container that is being filled."""
-
-    recording: Recording
-    tops: np.ndarray  # of the contents, without rounding, mm, [W_T, D_T]
-    items: list[PackedItem] = field(default_factory=list)
-    left: Numbered = field(default_factory=list)  # those that found no place
 
 
 def _in_bins(cell: CellSpec, variants: Sequence[Sequence[Variant]]) -> Item:
@@ -327,18 +251,44 @@ def _in_bins(cell: CellSpec, variants: Sequence[Sequence[Variant]]) -> Item:
     return Item.from_table(table)
 
 
-def _oriented(item: OrderItem, orientation: str) -> tuple[float, float, float]:
-    """Return an item's sides along x, y and z, mm."""
-    sides = {"l": item.length, "w": item.width, "h": item.height}
-    x, y, z = (sides[letter] for letter in orientation)
-    return x, y, z
+def _allow_places_on_one(
+    fills: Sequence[Filling],
+    items: Sequence[tuple[int, OrderItem]],
+    variants: Sequence[Sequence[Variant]],
+    state: State,
+    maps: PlacingMaps,
+) -> Tensor:
+    """Allow the places where an item lies wholly on another one, in place; return a mask of them, as ``maps.top``.
+
+    Args:
+        fills: the containers.
+        items: the next one of each container.
+        variants: faces on which it may lie.
+        state: heights and loads of the containers.
+        maps: of the variants.
+    """
+    on_one = torch.zeros_like(maps.top, dtype=torch.bool)
+    free, rest = on_one.numpy(), maps.rest.numpy()  # small parts of arrays take less time than those of tensors
+    bears = None if state.capacity is None else (state.capacity >= maps.item.grams.view(-1, 1, 1)).numpy()
+    for row, (fill, (_, item), each) in enumerate(zip(fills, items, variants, strict=True)):
+        for place, (face, (_, _, h, *_)) in enumerate(each):
+            number = row * maps.bin_items + place
+            for turn, orientation in enumerate(face):
+                for cells, z in fill.places_on_one(oriented(item, orientation)):
+                    if z + h <= state.tote_height[row]:
+                        carried = True if bears is None else bears[number][cells]
+                        free[number, turn][cells] |= (rest[number, turn][cells] == z) & carried
+    torch.where(on_one, maps.rest + maps.item.h.int().view(-1, 1, 1, 1), maps.top, out=maps.top)
+    return on_one
 
 
-def _alone(move: Move) -> Move:
-    """Return a move with its item alone in the bin, in the corner."""
-    x, y, *size = move.item
-    w, d, h = size
-    return replace(move, item=(0, 0, w, d, h), pick=(move.pick[0] - x, move.pick[1] - y), others=[])
+def _is_at(cell: CellSpec, state: State, action: Tensor, mask: Tensor) -> Tensor:
+    """Return whether actions, int64 ``[N]``, put an item down where a mask of the shape of ``maps.top`` is true."""
+    taken, item, blocked = take_item(cell, state.items, action)
+    _, rotation, _, (x, y, _, _) = carry(cell, item, action, blocked)
+    number = torch.arange(len(action)) * state.items.x.shape[1] + taken
+    wide, deep = cell.tote_size[:2]
+    return mask[number, rotation % 2, x.clamp(0, wide - 1), y.clamp(0, deep - 1)]
 
 
 def _sequences(items: Numbered) -> list[Numbered]:

@@ -15,7 +15,7 @@ from pickplace.common.errors import Parser, one_sentence, write_output
 from pickplace.common.validate import refuse_if
 
 if TYPE_CHECKING:
-    from pickplace.evaluation.pack import PackedContainer, PackedItem
+    from pickplace.evaluation.filling import PackedContainer, PackedItem
     from pickplace.physics.plans import EpisodePlan
 
 PAGE = re.compile(r"replay(_[1-9]\d*)?\.html")  # names of the pages

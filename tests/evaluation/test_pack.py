@@ -28,6 +28,9 @@ from pickplace.views import replay
 ORDERS = Path(__file__).resolve().parents[2] / "docs/examples/orders/orders.csv"
 CONTAINER, CELL = (419, 315, 250), 20  # whole cells leave 19 and 15 mm
 SIDES = st.tuples(st.integers(5, 200), st.integers(25, 200), st.one_of(st.integers(20, 120), st.floats(20, 120)))
+FEW_KINDS = st.lists(SIDES, min_size=1, max_size=3).flatmap(
+    lambda kinds: st.lists(st.sampled_from(kinds), min_size=1, max_size=25)
+)
 
 
 def overlap(one, other, axes=(0, 1, 2)):
@@ -77,7 +80,7 @@ def all_carried(items):
 
 
 @settings(max_examples=12, deadline=None)
-@given(st.lists(SIDES, min_size=1, max_size=25), st.booleans(), st.booleans())
+@given(st.one_of(st.lists(SIDES, min_size=1, max_size=25), FEW_KINDS), st.booleans(), st.booleans())
 def test_items_lie_apart_inside_and_are_carried(sizes, keep, tipping):
     items = [OrderItem(str(n), *map(float, sides), 100, f"line {n}") for n, sides in enumerate(sizes)]
     _, containers = OrderPacker(CONTAINER, CELL, tipping=tipping).pack(items, keep_sequence=keep)
@@ -210,6 +213,23 @@ def test_cells_that_an_item_fills_in_part_do_not_mislead(sizes):
     _, containers = OrderPacker((120, 100, 120), CELL, "joint_dbl").pack(items, keep_sequence=True)
     assert all(all_carried(each.items) for each in containers)
     assert len(containers) == 2
+
+
+@pytest.mark.parametrize("side", [75.0, 41.5, 35.0])
+def test_boxes_that_fill_no_whole_cells_stack(side):
+    """Nine piles of eight, and one box more."""
+    pitch = 20 * math.ceil(side / 20)
+    items = [OrderItem("", side, side, 30.0, 9, "line 1", max_load=63)] * 73
+    _, (first, second) = OrderPacker((3 * pitch, 3 * pitch, 250), CELL).pack(items)
+    assert (len(first.items), len(second.items)) == (72, 1) and all_carried(first.items)
+
+
+def test_an_item_lies_on_a_larger_one_up_to_its_far_side():
+    """Two of 35 mm on one of 75 mm: the second one just ends with it."""
+    sides = [(35, 75, 30), (35, 35, 20), (35, 35, 20)]
+    items = [OrderItem("", *map(float, each), 9, "line 1", orientations=("lwh",)) for each in sides]
+    _, (one,) = OrderPacker((40, 80, 100), CELL, "joint_dbl").pack(items, keep_sequence=True)
+    assert [packed.corner for packed in one.items] == [(0, 0, 0), (0, 0, 30), (0, 40, 30)]
 
 
 def test_tiny_items_and_orders_of_one_name_end(pack, tmp_path):
