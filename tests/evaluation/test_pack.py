@@ -232,6 +232,22 @@ def test_an_item_lies_on_a_larger_one_up_to_its_far_side():
     assert [packed.corner for packed in one.items] == [(0, 0, 0), (0, 0, 30), (0, 40, 30)]
 
 
+def test_an_item_lies_on_one_that_bears_it():
+    """The lower one bears 5 g only."""
+    sides = [(75, 75, 30, 5), (75, 75, 50, NO_LIMIT), (75, 75, 10, NO_LIMIT)]
+    items = [OrderItem("", *map(float, each), 9, "line 1", max_load) for *each, max_load in sides]
+    _, (one,) = OrderPacker((80, 160, 100), CELL, "joint_dbl").pack(items, keep_sequence=True)
+    assert [packed.corner for packed in one.items] == [(0, 0, 0), (0, 80, 0), (0, 80, 50)]
+
+
+def test_the_rest_of_an_item_under_another_one_carries_no_more_than_before():
+    """The second one lies on the first, which does not fill its last cells: there it carries no third one."""
+    sides = [(123, 128, 47), (41, 114, 65), (80, 15, 57)]
+    items = [OrderItem("", *map(float, each), 9, "line 1", orientations=("lwh",)) for each in sides]
+    _, containers = OrderPacker((182, 274, 207), 25).pack(items, keep_sequence=True)
+    assert all(all_carried(each.items) for each in containers)
+
+
 def test_tiny_items_and_orders_of_one_name_end(pack, tmp_path):
     """Orders keep apart, with one name in both files: those that differ by a control character, or clash with another
     one's second container."""
