@@ -1,85 +1,105 @@
-"""Measure the gain from a choice among several items in the bin: python benchmarks/bins.py
+"""Measure what a choice among several items gains: python benchmarks/bins.py
 
-Every method plays the same 100 episodes of the test stream at 8x8x8 with mixed items, for each number of items in the
-bin. Writes docs/results/bins.csv and docs/bins.png, and prints a table.
+Plays the test stream with 1 to 10 items to choose from, and with one item and previews of the next ones. Writes
+docs/results/bins.csv and docs/results/bins.png, and prints a table. outputs/bins keeps what was played, so that it is
+not played again. ``python benchmarks/bins.py gopt_rs`` plays only this task, so that several processes can share the
+work; the table and the figure then wait for the others.
 """
 
 import csv
 import sys
+from typing import NamedTuple
 
 from common import ROOT, evaluate
 
 from pickplace.views.figures import COLOURS, INK, figure_of
 
-TABLE, FIGURE, RUNS = ROOT / "docs" / "results" / "bins.csv", ROOT / "docs" / "bins.png", ROOT / "outputs" / "bins"
-COUNTS = (1, 2, 3, 5)
-VALUES, MIXED = ["checkpoint=pretrained/mixed"], ["items=mixed"]
+RESULTS, RUNS = ROOT / "docs" / "results", ROOT / "outputs" / "bins"
+EPISODES = 100  # where a task has no other number
+
+
+class Task(NamedTuple):
+    """Items, tote, gripper and weights."""
+
+    label: str
+    words: tuple[str, ...]  # for pickplace-evaluate
+    bin_size: str  # with several items: room for all of them nearly always
+    counts: tuple[int, ...]  # of items to choose from
+    previews: tuple[int, ...] = ()  # of the next items, with one item to choose from
+    episodes: int = 1000  # of the values without search
+
+
+TASKS = {
+    "gopt_rs": Task("gopt_rs, no gripper", ("checkpoint=pretrained/gopt_rs",), "[20,20,1]", (1, 3, 5, 10), (1, 4, 9)),
+    "plate_5x5": Task("gopt_rs, plate of 5x5", ("checkpoint=pretrained/plate_5x5",), "[20,20,1]", (1, 3, 5, 10)),
+    "mixed": Task(
+        "27 kinds, 8x8x8, gripper", ("checkpoint=pretrained/mixed", "env.tote_size=[8,8,8]"), "[8,8,1]", (1, 2, 3, 5),
+        episodes=200,
+    ),
+}  # fmt: skip
 #: Method -> its label, and words for pickplace-evaluate.
 METHODS = {
-    "learned": ("values of totes, any item", VALUES),
-    "beam": ("values of totes, beam search", [*VALUES, "planner=beam"]),
-    "learned_first": ("values of totes, first item that has a place", [*VALUES, "planner.item=first"]),
-    "joint_dbl": ("joint_dbl, any item", ["planner=joint_dbl", *MIXED]),
-    "joint_dbl_first": ("joint_dbl, first item that has a place", ["planner=joint_dbl", "planner.item=first", *MIXED]),
-    "individual_first": ("individual_heuristic, first item", ["planner=individual_heuristic", *MIXED]),
-    "individual_nearest": (
-        "individual_heuristic, nearest item",
-        ["planner=individual_heuristic", "planner.item=nearest", *MIXED],
-    ),
+    "beam": ("values, beam search", ("planner=beam", "physics=settle")),
+    "values": ("values", ()),
+    "best_fit": ("best_fit", ("planner=best_fit",)),
+    "joint_dbl": ("joint_dbl", ("planner=joint_dbl",)),
 }
-COLUMNS = ("method", "bin_items", "episodes", "mean", "low", "high", "minus_learned", "minus_low", "minus_high", "ms")
+COLUMNS = ("task", "bin_items", "preview", "method", "episodes", "mean", "low", "high", "settle_keeps", "ms")
 
 
-def measure(method: str, count: int) -> dict:
-    """Return a row of the table; episodes that were played before are not played again."""
-    folder, learned = (RUNS / f"{name}-{count}" for name in (method, "learned"))
-    words = [*METHODS[method][1], "env.tote_size=[8,8,8]", "env.bin_size=[8,8,1]", f"env.bin_items={count}"]
-    if method != "learned":
-        words.append(f"compare={learned / 'evaluation.json'}")
-    result = evaluate(folder, *words)
-    occupancy, paired = result["occupancy"], result.get("paired_difference")
-    row = {"method": method, "bin_items": count, "episodes": result["episodes"], "ms": result["latency_ms"]["p50"]}
+def measure(name: str, count: int, preview: int, method: str) -> dict:
+    """Return a row of the table."""
+    task = TASKS[name]
+    episodes = task.episodes if method == "values" else EPISODES
+    words = [*task.words, f"env.bin_items={count}", f"env.preview={preview}", f"evaluation.episodes={episodes}"]
+    words += [f"env.bin_size={task.bin_size}"] if count > 1 else []
+    words += [f"planner.depth={preview + 1}"] if preview else []  # looks at all of them
+    result = evaluate(RUNS / f"{name}-{count}-{preview}-{method}", *words, *METHODS[method][1])
+    occupancy, physics = result["occupancy"], result.get("physics")
+    row = {"task": name, "bin_items": count, "preview": preview, "method": method, "episodes": result["episodes"]}
     row |= {"mean": occupancy["mean"], "low": occupancy["ci95"][0], "high": occupancy["ci95"][1]}
-    if paired:
-        row |= {"minus_learned": paired["mean"], "minus_low": paired["ci95"][0], "minus_high": paired["ci95"][1]}
-    return row
+    return row | {"settle_keeps": physics and physics["carried_out"]["mean"], "ms": result["latency_ms"]["p50"]}
 
 
 def draw(rows: list[dict]) -> None:
-    """Draw the occupancy over the number of items in the bin, with intervals."""
-    figure = figure_of(8, 4.6)
-    axes = figure.subplots()
-    for colour, (method, (label, _)) in zip(COLOURS, METHODS.items(), strict=False):
-        line = [row for row in rows if row["method"] == method]
-        counts, means = [row["bin_items"] for row in line], [row["mean"] for row in line]
-        errors = [[row["mean"] - row["low"] for row in line], [row["high"] - row["mean"] for row in line]]
-        style = "-" if method in ("learned", "beam") else "--"
-        axes.errorbar(counts, means, errors, label=label, color=colour, marker="o", ls=style, capsize=3)
-    axes.set_xticks(COUNTS)
-    axes.set_xlabel("items in the bin")
-    axes.set_ylabel("occupancy, mean and 95% interval")
-    axes.grid(alpha=0.3)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.tick_params(colors=INK)
-    figure.legend(loc="outside right upper", frameon=False)
-    figure.savefig(FIGURE, dpi=120)
+    """Draw the occupancy over the number of items to choose from, with intervals; an area for each task."""
+    figure = figure_of(10, 4)
+    areas = figure.subplots(1, len(TASKS), sharey=True)
+    for axes, (name, task) in zip(areas, TASKS.items(), strict=True):
+        for colour, (method, (label, _)) in zip(COLOURS, METHODS.items(), strict=False):
+            line = [row for row in rows if (row["task"], row["method"], row["preview"]) == (name, method, 0)]
+            counts, means = [row["bin_items"] for row in line], [row["mean"] for row in line]
+            errors = [[row["mean"] - row["low"] for row in line], [row["high"] - row["mean"] for row in line]]
+            style = "-" if method in ("beam", "values") else "--"
+            axes.errorbar(counts, means, errors, label=label, color=colour, marker="o", ls=style, capsize=3)
+        axes.set_title(task.label, fontsize=10)
+        axes.set_xticks(task.counts)
+        axes.set_xlabel("items to choose from")
+        axes.grid(alpha=0.3)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.tick_params(colors=INK)
+    areas[0].set_ylabel("occupancy, mean and 95% interval")
+    figure.legend(*areas[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+    figure.savefig(RESULTS / "bins.png", dpi=120)
 
 
-def main() -> None:
-    rows = [measure(method, count) for count in COUNTS for method in METHODS]
-    with TABLE.open("w", newline="") as file:
+def main(names: list[str]) -> None:
+    if unknown := {*names} - {*TASKS}:
+        sys.exit(f"unknown task {min(unknown)}; expected one of {', '.join(TASKS)}")
+    rows = []
+    for name in names or TASKS:
+        task = TASKS[name]
+        rows += [measure(name, count, 0, method) for count in task.counts for method in METHODS]
+        rows += [measure(name, 1, preview, "beam") for preview in task.previews]
+    if names:
+        return
+    with (RESULTS / "bins.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()
         writer.writerows({key: round(v, 4) if isinstance(v, float) else v for key, v in row.items()} for row in rows)
     draw(rows)
-    lines = ["| method | " + " | ".join(f"M={count}" for count in COUNTS) + " |", "|---" * (len(COUNTS) + 1) + "|"]
-    for method, (label, _) in METHODS.items():
-        cells = [
-            f"{row['mean']:.3f} ({row['low']:.3f} to {row['high']:.3f})" for row in rows if row["method"] == method
-        ]
-        lines.append(f"| {label} | " + " | ".join(cells) + " |")
-    sys.stdout.write("\n".join(lines) + "\n")
+    sys.stdout.write((RESULTS / "bins.csv").read_text())
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])
