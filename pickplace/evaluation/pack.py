@@ -222,8 +222,9 @@ class OrderPacker:
                     fill.left.append(each)
                 continue
             action = planner.choose(cell, state, maps, {})
-            alone = _is_at(cell, state, action, on_one)[:, None, None]
-            step = apply(cell, state._replace(surface=torch.where(alone, surface | 1, surface)), action)
+            turns, alone = _turns_on_one(cell, state, action, on_one)
+            bearing_all = torch.where(alone[:, None, None], surface | 1, surface)
+            step = apply(cell, state._replace(surface=bearing_all), action)
             same = step.surface >> 1 == surface >> 1
             after, pile = state._replace(surface=torch.where(same, surface, step.surface)), step.pile
             heights, bearing = after.heights, after.bearing
@@ -232,7 +233,7 @@ class OrderPacker:
                     fills[row].left.append(items[row])
                     continue
                 face = variants[row][int(step.taken[row])][0]
-                fills[row].put_down(items[row], face[move.rotation % 2], move, heights[row], bearing[row])
+                fills[row].put_down(items[row], face[turns[row]], move, heights[row], bearing[row])
             surface = surface_from(heights, bearing)
         return [fill.closed(math.prod(self.container)) for fill in fills]
 
@@ -260,6 +261,8 @@ def _allow_places_on_one(
 ) -> Tensor:
     """Allow the places where an item lies wholly on another one, in place; return a mask of them, as ``maps.top``.
 
+    The rules list a square footprint as not turned only. So it is allowed if the item fits in either turn.
+
     Args:
         fills: the containers.
         items: the next one of each container.
@@ -273,22 +276,34 @@ def _allow_places_on_one(
     for row, (fill, (_, item), each) in enumerate(zip(fills, items, variants, strict=True)):
         for place, (face, (_, _, h, *_)) in enumerate(each):
             number = row * maps.bin_items + place
-            for turn, orientation in enumerate(face):
-                for cells, z in fill.places_on_one(oriented(item, orientation)):
+            for turn in [turn for turn in (0, 1) if face[turn] in item.orientations]:
+                for cells, z in fill.places_on_one(oriented(item, face[turn])):
                     if z + h <= state.tote_height[row]:
                         carried = True if bears is None else bears[number][cells]
                         free[number, turn][cells] |= (rest[number, turn][cells] == z) & carried
-    torch.where(on_one, maps.rest + maps.item.h.int().view(-1, 1, 1, 1), maps.top, out=maps.top)
+    square = (maps.item.w == maps.item.d).view(-1, 1, 1, 1)
+    allowed = on_one | (square & on_one.flip(1))
+    torch.where(allowed, maps.rest + maps.item.h.int().view(-1, 1, 1, 1), maps.top, out=maps.top)
     return on_one
 
 
-def _is_at(cell: CellSpec, state: State, action: Tensor, mask: Tensor) -> Tensor:
-    """Return whether actions, int64 ``[N]``, put an item down where a mask of the shape of ``maps.top`` is true."""
+def _turns_on_one(cell: CellSpec, state: State, action: Tensor, on_one: Tensor) -> tuple[list[int], Tensor]:
+    """Return how actions, int64 ``[N]``, turn their items, and whether these lie wholly on another one, bool ``[N]``.
+
+    An item with a square footprint is turned so that it does.
+
+    Args:
+        on_one: see :func:`_allow_places_on_one`.
+    """
     taken, item, blocked = take_item(cell, state.items, action)
     _, rotation, _, (x, y, _, _) = carry(cell, item, action, blocked)
     number = torch.arange(len(action)) * state.items.x.shape[1] + taken
     wide, deep = cell.tote_size[:2]
-    return mask[number, rotation % 2, x.clamp(0, wide - 1), y.clamp(0, deep - 1)]
+    here = on_one[number, :, x.clamp(0, wide - 1), y.clamp(0, deep - 1)]  # [N, 2]
+    turn = rotation % 2
+    own, other = (here.gather(1, each[:, None])[:, 0] for each in (turn, 1 - turn))
+    other &= item.w == item.d
+    return torch.where(other & ~own, 1 - turn, turn).tolist(), own | other
 
 
 def _sequences(items: Numbered) -> list[Numbered]:

@@ -233,6 +233,17 @@ def test_an_item_lies_on_a_larger_one_up_to_its_far_side(side, corners):
     assert [packed.corner for packed in first.items[1:]] == corners
 
 
+@pytest.mark.parametrize("planner", ["joint_dbl", "heightmap_minimisation", "individual_heuristic"])
+def test_an_item_is_turned_to_lie_on_another_one(planner):
+    """Both take 4 x 4 cells. The second one fits on the first if it is turned, and only if it may be turned."""
+    for orientations, count in ((ORIENTATIONS, 2), (("lwh",), 1)):
+        items = [OrderItem("", 75.0, 65.0, 30.0, 9, "line 1", orientations=("lwh",))]
+        items.append(OrderItem("", 65.0, 75.0, 30.0, 9, "line 1", orientations=orientations))
+        _, (first, *_) = OrderPacker((80, 80, 100), CELL, planner).pack(items, keep_sequence=True)
+        assert [packed.turned for packed in first.items] == [False, True][:count]
+        assert all_carried(first.items)
+
+
 def test_an_item_lies_on_one_that_bears_it():
     """The lower one bears 5 g only."""
     sides = [(75, 75, 30, 5), (75, 75, 50, NO_LIMIT), (75, 75, 10, NO_LIMIT)]
