@@ -3,7 +3,7 @@
 Plays the test stream with 1 to 10 items to choose from, and with one item and previews of the next ones. Writes
 docs/results/bins.csv and docs/results/bins.png, and prints a table. outputs/bins keeps what was played, so that it is
 not played again. ``python benchmarks/bins.py gopt_rs`` plays only this task, so that several processes can share the
-work; the table and the figure then wait for the others.
+work; the table and the figure then wait for the others. Delete outputs/bins after a change of what is played.
 """
 
 import csv
@@ -15,7 +15,7 @@ from common import ROOT, evaluate
 from pickplace.views.figures import COLOURS, INK, figure_of
 
 RESULTS, RUNS = ROOT / "docs" / "results", ROOT / "outputs" / "bins"
-EPISODES = 100  # where a task has no other number
+EPISODES = 100  # of all methods but values
 
 
 class Task(NamedTuple):

@@ -3,9 +3,10 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from torch import Tensor
 
 from pickplace.items.order_file import ORIENTATIONS, OrderItem
@@ -34,11 +35,6 @@ class PackedItem:
         """Sides along x, y and z, mm."""
         return oriented(self.item, self.orientation)
 
-    @property
-    def top(self) -> float:
-        """Height of its top, mm."""
-        return self.corner[2] + self.size[2]
-
 
 @dataclass(frozen=True)
 class PackedContainer:
@@ -55,7 +51,18 @@ class PackedContainer:
     @property
     def top(self) -> float:
         """Height of the highest item, mm."""
-        return max((packed.top for packed in self.items), default=0.0)
+        return max((packed.corner[2] + packed.size[2] for packed in self.items), default=0.0)
+
+
+class Carrier(NamedTuple):
+    """An item that is carried at all four corners, so that it carries others everywhere."""
+
+    x: int  # least cell
+    y: int
+    sides: tuple[float, float]  # true ones along x and y, mm
+    top: float  # mm
+    z: int  # its top, rounded up
+    tops: np.ndarray  # of what lies on its cells, itself included: a view of those of the container
 
 
 @dataclass
@@ -70,25 +77,31 @@ class Filling:
     cell_mm: int  # side of a cell
     tops: np.ndarray  # of the contents, without rounding, mm, [W_T, D_T]
     items: list[PackedItem] = field(default_factory=list)
-    carriers: list[tuple[PackedItem, np.ndarray]] = field(default_factory=list)  # carried at all corners; their `tops`
+    carriers: list[Carrier] = field(default_factory=list)  # those that nothing covers wholly
     left: Numbered = field(default_factory=list)  # those that found no place
 
-    def places_on_one(self, size: tuple[float, float, float]) -> Iterator[tuple[tuple[slice, slice], int]]:
-        """Yield the places where an item would lie wholly on another one, if that is free from above.
+    def places_on_one(
+        self, size: tuple[float, float, float]
+    ) -> Iterator[tuple[tuple[slice, slice], np.ndarray | bool, int]]:
+        """Yield the places where an item would lie wholly on another one.
 
         Args:
             size: true sides of the item along x, y and z, mm.
 
-        Returns:
-            for each item that is large enough and bears weight everywhere: the cells of the new item's corner, and the
-            height of its underside, mm, rounded up.
+        Yields:
+            for each item that is large enough: a rectangle of cells for the corner of the new one; which of them leave
+            it nothing else to lie on; and the height of its underside, mm, rounded up.
         """
-        for packed, _ in self.carriers:
-            spare = [packed.size[axis] - size[axis] + 1e-6 for axis in (0, 1)]
-            if min(spare) >= 0:
-                first = [packed.corner[axis] // self.cell_mm for axis in (0, 1)]
-                x, y = (slice(at, at + 1 + int(more // self.cell_mm)) for at, more in zip(first, spare, strict=True))
-                yield (x, y), math.ceil(packed.top - 1e-6)
+        w, d = (max(1, math.ceil(side / self.cell_mm - 1e-6)) for side in size[:2])
+        for x, y, sides, top, z, tops in self.carriers:
+            spare = [side - own + 1e-6 for side, own in zip(sides, size, strict=False)]
+            if min(spare) < 0:
+                continue
+            nx, ny = (min(1 + int(spare[a] // self.cell_mm), tops.shape[a] + 1 - own) for a, own in enumerate((w, d)))
+            free: np.ndarray | bool = bool(tops.max() <= top)  # everywhere
+            if not free:
+                free = (sliding_window_view(tops, (w, d)).max((2, 3)) <= top)[:nx, :ny]
+            yield (slice(x, x + nx), slice(y, y + ny)), free, z
 
     def put_down(
         self, numbered: tuple[int, OrderItem], orientation: str, move: Move, heights: Tensor, bearing: Tensor
@@ -107,13 +120,13 @@ class Filling:
         packed = PackedItem(item, number, (x * self.cell_mm, y * self.cell_mm, round(below, 6)), orientation)
         self.recording.moves.append(_alone(move))
         self.items.append(packed)
-        self.tops[x : x + w, y : y + d] = below + packed.size[2]
+        self.tops[x : x + w, y : y + d] = top = below + packed.size[2]
         # A top is rounded up once, not with each item of its pile: so level tops are level within a millimetre.
-        heights[x : x + w, y : y + d] = math.ceil(below + packed.size[2] - 1e-6)
+        heights[x : x + w, y : y + d] = z = math.ceil(top - 1e-6)
         part = bearing[x : x + w, y : y + d]
         if part.all():
-            self.carriers.append((packed, self.tops[x : x + w, y : y + d]))
-        self.carriers = [(each, tops) for each, tops in self.carriers if tops.min() < each.top + 1e-3]  # free somewhere
+            self.carriers.append(Carrier(x, y, packed.size[:2], top, z, self.tops[x : x + w, y : y + d]))
+        self.carriers = [each for each in self.carriers if each.tops.min() <= each.top]
         # Where cells that it does not fill support it, its true support ends up to a cell earlier than on the grid. So
         # any other cell then bears only if the cell after it does, too.
         unfilled = [axis for axis, count in enumerate((w, d)) if packed.size[axis] < count * self.cell_mm - 1e-6]

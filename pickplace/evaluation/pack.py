@@ -233,7 +233,8 @@ class OrderPacker:
                     fills[row].left.append(items[row])
                     continue
                 face = variants[row][int(step.taken[row])][0]
-                fills[row].put_down(items[row], face[turns[row]], move, heights[row], bearing[row])
+                move = replace(move, rotation=(turn := turns[row]))
+                fills[row].put_down(items[row], face[turn], move, heights[row], bearing[row])
             surface = surface_from(heights, bearing)
         return [fill.closed(math.prod(self.container)) for fill in fills]
 
@@ -271,16 +272,15 @@ def _allow_places_on_one(
         maps: of the variants.
     """
     on_one = torch.zeros_like(maps.top, dtype=torch.bool)
-    free, rest = on_one.numpy(), maps.rest.numpy()  # small parts of arrays take less time than those of tensors
+    places = on_one.numpy()  # small parts of arrays take less time than those of tensors
     bears = None if state.capacity is None else (state.capacity >= maps.item.grams.view(-1, 1, 1)).numpy()
     for row, (fill, (_, item), each) in enumerate(zip(fills, items, variants, strict=True)):
         for place, (face, (_, _, h, *_)) in enumerate(each):
             number = row * maps.bin_items + place
             for turn in [turn for turn in (0, 1) if face[turn] in item.orientations]:
-                for cells, z in fill.places_on_one(oriented(item, face[turn])):
+                for cells, free, z in fill.places_on_one(oriented(item, face[turn])):
                     if z + h <= state.tote_height[row]:
-                        carried = True if bears is None else bears[number][cells]
-                        free[number, turn][cells] |= (rest[number, turn][cells] == z) & carried
+                        places[number, turn][cells] |= free & (True if bears is None else bears[number][cells])
     square = (maps.item.w == maps.item.d).view(-1, 1, 1, 1)
     allowed = on_one | (square & on_one.flip(1))
     torch.where(allowed, maps.rest + maps.item.h.int().view(-1, 1, 1, 1), maps.top, out=maps.top)

@@ -244,6 +244,22 @@ def test_an_item_is_turned_to_lie_on_another_one(planner):
         assert all_carried(first.items)
 
 
+@pytest.mark.parametrize("planner", ["joint_dbl", "heightmap_minimisation", "best_fit", "corner", "online_bph"])
+def test_boxes_that_lie_turned_stack(planner):
+    """Four piles of eight: a place on another one is not taken for one of the other turn."""
+    items = [OrderItem("", 75.0, 65.0, 30.0, 9, "line 1", orientations=("wlh",))] * 32
+    _, containers = OrderPacker((160, 160, 250), CELL, planner).pack(items, keep_sequence=True)
+    assert [len(each.items) for each in containers] == [32]
+
+
+def test_an_item_lies_beside_sheets_that_bear_nothing():
+    """The sheets end below the same whole millimetre as the box on which they lie."""
+    sides = [(155, 75, 30.2, 9, NO_LIMIT), (15, 75, 0.5, 9, 20), (15, 75, 0.5, 50, 0), (55, 55, 20, 9, NO_LIMIT)]
+    items = [OrderItem("", *map(float, each), grams, "line 1", load, ("lwh",)) for *each, grams, load in sides]
+    _, (one,) = OrderPacker((160, 80, 60), CELL, "joint_dbl").pack(items, keep_sequence=True)
+    assert [packed.corner[0] for packed in one.items] == [0, 0, 20, 40]
+
+
 def test_an_item_lies_on_one_that_bears_it():
     """The lower one bears 5 g only."""
     sides = [(75, 75, 30, 5), (75, 75, 50, NO_LIMIT), (75, 75, 10, NO_LIMIT)]
@@ -252,8 +268,8 @@ def test_an_item_lies_on_one_that_bears_it():
     assert [packed.corner for packed in one.items] == [(0, 0, 0), (0, 80, 0), (0, 80, 50)]
 
 
-def test_the_rest_of_an_item_under_another_one_carries_no_more_than_before():
-    """The second one lies on the first, which does not fill its last cells: there it carries no third one."""
+def test_the_last_cells_of_an_item_under_another_one_still_carry_nothing_else():
+    """The first one does not fill them. The second one lies on it wholly, the third one would lie across."""
     sides = [(123, 128, 47), (41, 114, 65), (80, 15, 57)]
     items = [OrderItem("", *map(float, each), 9, "line 1", orientations=("lwh",)) for each in sides]
     _, containers = OrderPacker((182, 274, 207), 25).pack(items, keep_sequence=True)
