@@ -62,7 +62,7 @@ class Carrier(NamedTuple):
     sides: tuple[float, float]  # true ones along x and y, mm
     top: float  # mm
     z: int  # its top, rounded up
-    tops: np.ndarray  # of what lies on its cells, itself included: a view of those of the container
+    tops: np.ndarray  # the part of Filling.tops over its cells; a view
 
 
 @dataclass
@@ -127,8 +127,8 @@ class Filling:
         if part.all():
             self.carriers.append(Carrier(x, y, packed.size[:2], top, z, self.tops[x : x + w, y : y + d]))
         self.carriers = [each for each in self.carriers if each.tops.min() <= each.top]
-        # Where cells that it does not fill support it, its true support ends up to a cell earlier than on the grid. So
-        # any other cell then bears only if the cell after it does, too.
+        # Something may support it in cells that it does not fill. Then its true support ends up to a cell earlier than
+        # on the grid. So any other cell bears only if the cell after it does, too.
         unfilled = [axis for axis, count in enumerate((w, d)) if packed.size[axis] < count * self.cell_mm - 1e-6]
         for axis in [axis for axis in unfilled if part.select(axis, part.shape[axis] - 1).any()]:
             count = part.shape[axis] - 1

@@ -223,6 +223,7 @@ class OrderPacker:
                 continue
             action = planner.choose(cell, state, maps, {})
             turns, alone = _turns_on_one(cell, state, action, on_one)
+            # For an item that lies wholly on another one, all cells bear. Those that it does not cover are restored.
             bearing_all = torch.where(alone[:, None, None], surface | 1, surface)
             step = apply(cell, state._replace(surface=bearing_all), action)
             same = step.surface >> 1 == surface >> 1
