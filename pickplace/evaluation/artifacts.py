@@ -82,8 +82,10 @@ def evaluation_table(result: dict) -> str:
     words = {True: "yes", False: "no", None: "unknown"}
     masks = (result.get(key) for key in ("mask_in_training", "mask_at_decision"))
     training, decision = (words.get(mask, mask) for mask in masks)
+    planner = result.get("planner_settings", {})
+    settings = [f"{key}={'null' if value is None else value}" for key, value in planner.items()]
     rows = {
-        "planner": result["planner"],
+        "planner": " ".join([result["planner"], *settings]),
         "tote, rotations": f"{'x'.join(map(str, env['tote_size']))}, R={env['rotations']}",
         "orientations": env.get("tipping") and f"{POSES * min(env['rotations'], 2)}: items may be tipped",
         "items in the bin": count > 1 and f"up to {count}, refill: {env.get('refill', 'each')}",

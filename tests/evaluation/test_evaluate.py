@@ -166,7 +166,8 @@ def test_benchmarks_are_the_papers_settings(evaluation, name, least, rotations, 
 def test_evaluation_json(command, evaluation, group, stream, seed):
     settings = [f"evaluation={group}", f"evaluation.seed={seed}", "evaluation.episodes=5"]
     settings += ["evaluation.latency_decisions=3", "env.tote_size=[4,5,2]", "evaluation.batch_size=2"]
-    result = (command if group == "default" else evaluation)("planner=joint_dbl", *settings)
+    words = ["planner=joint_dbl", "planner.item=first"]
+    result = (command if group == "default" else evaluation)(*words, *settings)
     assert (result["planner"], result["episodes"], result["seed"], result["stream"]) == ("joint_dbl", 5, seed, stream)
     assert result["env"]["tote_size"] == [4, 5, 2] and result["env"]["rotations"] == 4
     occupancy, latency = result["occupancy"], result["latency_ms"]
@@ -176,7 +177,7 @@ def test_evaluation_json(command, evaluation, group, stream, seed):
     assert 0 < latency["p50"] <= latency["p95"] < 60_000
     assert set(result["versions"]) >= {"pickplace", "torch", "torchrl", "tensordict", "python"}
     assert {path.name for path in result["path"].parent.iterdir()} >= {"tote.png", "evaluation.md"}
-    assert "occupancy" in result["out"]
+    assert "| joint_dbl item=first " in result["out"]
 
     def make_env(first, count):
         settings = {"tote_size": (4, 5, 2), "stream": stream, "seed": seed, "masks": ()}
