@@ -45,12 +45,15 @@ class Training(NamedTuple):
 
 #: The paper's network needs this long. The other methods get the same.
 RECIPE = "experiment=paper_fast"
+ONE_ROTATION = "env.rotations=1 total_frames=800_000"  # a quarter of the actions
 #: By method and R.
 TRAININGS = {
     ("fcn4d", 4): Training(RECIPE, 2.0, SMALL + LARGE),
     ("fcn4d", 3): Training(f"{RECIPE} env.rotations=3", 2.0),
+    ("fcn4d", 1): Training(f"{RECIPE} {ONE_ROTATION}", 2.0, seeds=1),
     ("individual_rl", 4): Training(f"{RECIPE} model=individual_rl", 1.0),
     ("individual_rl", 3): Training(f"{RECIPE} model=individual_rl env.rotations=3", 1.0),
+    ("individual_rl", 1): Training(f"{RECIPE} model=individual_rl {ONE_ROTATION}", 1.0, seeds=1),
     ("fcn4d_noclip", 4): Training(f"{RECIPE} model=fcn4d_noclip env.tote_size=[6,6,10]", 2.0, ("6x6x10",)),
     ("typical", 4): Training(f"{RECIPE} model=typical", 6.0, ("6x6x5",), 1),
     ("paper", 4): Training("experiment=paper total_frames=250_000", 2.0, ("6x6x5",), 1),
@@ -112,8 +115,9 @@ class Run(NamedTuple):
 
 def heuristic_cells() -> Iterator[Cell]:
     """Yield what the methods that are not trained play."""
-    for method, turns, tote in product(("joint_dbl", "individual_heuristic"), (3, 4), SMALL + LARGE):
-        yield Cell(method, turns, tote)
+    for method, turns, tote in product(("joint_dbl", "individual_heuristic"), (1, 3, 4), SMALL + LARGE):
+        if turns == 4 or tote not in LARGE:
+            yield Cell(method, turns, tote)
     yield from (Cell("mcts", 4, tote) for tote in SMALL[:3])
 
 
