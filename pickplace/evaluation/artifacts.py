@@ -84,7 +84,7 @@ def evaluation_table(result: dict) -> str:
     training, decision = (words.get(mask, mask) for mask in masks)
     planner = result.get("planner_settings", {})
     settings = [f"{key}={'null' if value is None else value}" for key, value in planner.items()]
-    rows = {
+    rows: dict[str, Any] = {
         "planner": " ".join([result["planner"], *settings]),
         "tote, rotations": f"{'x'.join(map(str, env['tote_size']))}, R={env['rotations']}",
         "orientations": env.get("tipping") and f"{POSES * min(env['rotations'], 2)}: items may be tipped",

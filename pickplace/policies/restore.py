@@ -156,6 +156,20 @@ def differences(ours: Any, theirs: Any, place: str = "") -> Iterator[tuple[str, 
         yield place, ours, theirs
 
 
+def changed_settings(ours: dict, theirs: dict, with_critic: bool) -> Iterator[tuple[str, Any, Any]]:
+    """Yield the settings in which a training differs from that of the weights it begins with, as :func:`differences`.
+
+    Args:
+        ours, theirs: the whole configs. What an older one lacks in its group ``env`` had the default.
+        with_critic: whether the weights have a critic, which expects discounted, scaled rewards.
+    """
+    yield from differences(ours["env"], cell_settings(CellSpec()) | theirs["env"], "env")
+    yield from differences(ours["items"], theirs["items"], "items")
+    if with_critic:
+        yield from differences(ours["reward_scale"], theirs["reward_scale"], "reward_scale")
+        yield from differences(ours["algo"].get("gamma"), theirs["algo"].get("gamma"), "algo.gamma")
+
+
 def load_policy(path, device: str = "cpu", trust: Sequence[str] = (), **sizes) -> TrainedPolicy:
     """Return the policy of a checkpoint as a module; its ``make_env()`` makes an environment for it.
 

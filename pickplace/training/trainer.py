@@ -5,7 +5,6 @@ import shlex
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import Any, cast
 
@@ -24,7 +23,7 @@ from pickplace.envs.saved_state import check_saved_states
 from pickplace.evaluation.play import Episodes, evaluation_mode, play
 from pickplace.evaluation.result import confidence95
 from pickplace.policies.base import EstimatesValue, Policy, as_critic, refuse_large_network
-from pickplace.policies.restore import differences
+from pickplace.policies.restore import changed_settings
 from pickplace.rules.state import Failure
 from pickplace.runs import checkpoint, folder, provenance
 from pickplace.runs.locate import locate
@@ -134,12 +133,7 @@ class Trainer:
         if not self.resumed and (path := cfg.warm_start.weights) is not None:
             weights, facts = checkpoint.read(locate(path, key="warm_start.weights"))
             log.info("beginning with the weights of %s, after %s frames", path, f"{facts['frames']:,}")
-            ours, theirs = self.saved_config, facts["config"]
-            pairs = [(group, ours[group], theirs[group]) for group in ("env", "items")]
-            if "critic" in weights:  # it expects discounted, scaled rewards
-                pairs.append(("reward_scale", ours["reward_scale"], theirs["reward_scale"]))
-                pairs.append(("algo.gamma", ours["algo"].get("gamma"), theirs["algo"].get("gamma")))
-            for key, now, before in chain.from_iterable(differences(*pair[1:], pair[0]) for pair in pairs):
+            for key, now, before in changed_settings(self.saved_config, facts["config"], "critic" in weights):
                 log.info("%s is %s; those weights were trained with %s", key, excerpt(now), excerpt(before))
         make = partial(build, cell=env.cell)
         make_actor = partial(make, "model.actor", cfg.model.actor, mask_infeasible=cfg.model.mask_infeasible)

@@ -304,6 +304,7 @@ def test_a_training_may_begin_with_the_weights_of_another_one(tmp_path, caplog):
         assert all(torch.equal(value, state[key][name]) for name, value in module.state_dict().items())
     assert begun.frames == 0 and not begun.resumed
     assert "env.tote_size is [6, 5, 2]; those weights were trained with [6, 6, 5]" in caplog.messages
+    assert "env.preview is 0" not in caplog.text and "env.tipping is" not in caplog.text  # newer than those weights
     for message in ("algo.gamma is 0.5; those", "reward_scale is 1; those", "curriculum.levels: NoAdvance plays"):
         assert message in caplog.text  # values of the critic; and levels that are never played
     bare = Trainer(composed(*words, "model=fcn4d", "warm_start.weights=pretrained/paper"), tmp_path)
