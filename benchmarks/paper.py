@@ -333,7 +333,8 @@ def draw_learning() -> None:
 def draw_methods(rows: list[dict]) -> None:
     """Draw the methods of reinforcement learning and tree search, as the paper's Fig. 9."""
     figure, (axes,) = panels(width=10)
-    draw_bars(axes, rows, ("mcts", "typical", "fcn4d_noclip", "fcn4d", "joint_dbl"), SMALL + LARGE, 1, 4)
+    totes = tuple(tote for tote in SMALL + LARGE if found(rows, method="fcn4d", R=4, tote=tote))
+    draw_bars(axes, rows, ("mcts", "typical", "fcn4d_noclip", "fcn4d", "joint_dbl"), totes, 1, 4)
     axes.set_ylabel("occupancy, R=4, K=1")
     finish(figure, [axes], "methods")
 
