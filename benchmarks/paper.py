@@ -45,7 +45,7 @@ class Training(NamedTuple):
 
 #: The paper's network needs this long. The other methods get the same.
 RECIPE = "experiment=paper_fast"
-ONE_ROTATION = "env.rotations=1 total_frames=800_000"  # a quarter of the actions
+ONE_ROTATION = "env.rotations=1 total_frames=800_000"  # there are a quarter of the actions to learn
 #: By method and R.
 TRAININGS = {
     ("fcn4d", 4): Training(RECIPE, 2.0, SMALL + LARGE),

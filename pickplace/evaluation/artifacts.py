@@ -82,8 +82,8 @@ def evaluation_table(result: dict) -> str:
     words = {True: "yes", False: "no", None: "unknown"}
     masks = (result.get(key) for key in ("mask_in_training", "mask_at_decision"))
     training, decision = (words.get(mask, mask) for mask in masks)
-    planner = result.get("planner_settings", {})
-    settings = [f"{key}={'null' if value is None else value}" for key, value in planner.items()]
+    given = result.get("planner_settings", {}).items()
+    settings = [f"{key}={'null' if value is None else value}" for key, value in given]
     rows: dict[str, Any] = {
         "planner": " ".join([result["planner"], *settings]),
         "tote, rotations": f"{'x'.join(map(str, env['tote_size']))}, R={env['rotations']}",

@@ -157,10 +157,11 @@ def differences(ours: Any, theirs: Any, place: str = "") -> Iterator[tuple[str, 
 
 
 def changed_settings(ours: dict, theirs: dict, with_critic: bool) -> Iterator[tuple[str, Any, Any]]:
-    """Yield the settings in which a training differs from that of the weights it begins with, as :func:`differences`.
+    """Yield the settings that have changed since the weights were trained, as :func:`differences`.
 
     Args:
-        ours, theirs: the whole configs. What an older one lacks in its group ``env`` had the default.
+        ours: the whole config of a training that begins with these weights.
+        theirs: that of their own training. What an older one lacks in its group ``env`` had the default.
         with_critic: whether the weights have a critic, which expects discounted, scaled rewards.
     """
     yield from differences(ours["env"], cell_settings(CellSpec()) | theirs["env"], "env")
