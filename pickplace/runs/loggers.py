@@ -44,18 +44,19 @@ class CsvLogger:
     """
 
     def __init__(self, folder, frames: int = 0, settings: dict | None = None):
-        self.path, self._columns = Path(folder) / "metrics.csv", ["frames"]
-        earlier = read_rows(self.path) if frames and self.path.is_file() else []
+        # Two underscores: a user's logger may have a path or a file of its own.
+        self.__path, self.__columns = Path(folder) / "metrics.csv", ["frames"]
+        earlier = read_rows(self.__path) if frames and self.__path.is_file() else []
         self._rewrite([row for row in earlier if int(float(row["frames"])) <= frames])
 
     def _rewrite(self, rows):
-        self._columns = [*dict.fromkeys([*self._columns, *(key for row in rows for key in row)])]
-        with replaced_file(self.path) as new, new.open("w", newline="") as file:
-            writer = csv.DictWriter(file, self._columns)
+        self.__columns = [*dict.fromkeys([*self.__columns, *(key for row in rows for key in row)])]
+        with replaced_file(self.__path) as new, new.open("w", newline="") as file:
+            writer = csv.DictWriter(file, self.__columns)
             writer.writeheader()
             writer.writerows(rows)
-        self._file: IO[str] = self.path.open("a+", newline="")  # readable, also after its name is gone
-        self._writer = csv.DictWriter(self._file, self._columns)
+        self.__file: IO[str] = self.__path.open("a+", newline="")  # readable, also after its name is gone
+        self.__writer = csv.DictWriter(self.__file, self.__columns)
 
     def log(self, metrics: dict[str, float], frames: int) -> None:
         """Add a row.
@@ -64,27 +65,27 @@ class CsvLogger:
             OSError: naming the file, if it cannot be written.
         """
         row = {"frames": frames, **metrics}
-        with reword_errors(OSError, lambda error: OSError(error.errno, error.strerror, str(self.path))):
+        with reword_errors(OSError, lambda error: OSError(error.errno, error.strerror, str(self.__path))):
             self._restore()
-            if set(row) <= set(self._columns):
-                self._writer.writerow(row)
-                self._file.flush()
+            if set(row) <= set(self.__columns):
+                self.__writer.writerow(row)
+                self.__file.flush()
             else:
                 self._rewrite([*self._closed_rows(), row])
 
     def _closed_rows(self) -> list[dict[str, str]]:
-        with self._file as file:
+        with self.__file as file:
             file.seek(0)
-            return read_rows(self.path, file.read())
+            return read_rows(self.__path, file.read())
 
     def _restore(self) -> None:
         """Write the table again, with a warning, if its path no longer leads to the open file, or the file was cut."""
-        ours = os.fstat(self._file.fileno())
+        ours = os.fstat(self.__file.fileno())
         with suppress(FileNotFoundError):
-            if os.path.samestat(ours, self.path.stat()) and ours.st_size >= self._file.tell():
+            if os.path.samestat(ours, self.__path.stat()) and ours.st_size >= self.__file.tell():
                 return
-        log.warning("%s was deleted, replaced or cut while the training writes it; it is written again", self.path)
-        self.path.parent.mkdir(parents=True, exist_ok=True)
+        log.warning("%s was deleted, replaced or cut while the training writes it; it is written again", self.__path)
+        self.__path.parent.mkdir(parents=True, exist_ok=True)
         self._rewrite(self._closed_rows())
 
     def close(self) -> None:
@@ -92,7 +93,7 @@ class CsvLogger:
         with suppress(OSError, ValueError):  # a ValueError if a full disk has closed it
             self._restore()
         with suppress(OSError):
-            self._file.close()
+            self.__file.close()
 
 
 class BackendLogger(CsvLogger):

@@ -1,6 +1,7 @@
 """Loggers: metrics survive a killed run, and every backend goes on after a resume."""
 
 import csv
+import json
 import sys
 
 import pytest
@@ -30,6 +31,33 @@ def test_metrics_survive_a_cut_line_and_a_resume(tmp_path):
     logger.close()
     rows = read_csv(tmp_path / "metrics.csv")
     assert rows == [{"frames": 10, "a": 1.0}, {"frames": 20, "a": 2.0, "b": 5.0}, {"frames": 30, "a": 7.0}]
+
+
+class JsonLines(CsvLogger):
+    """A user's logger, which writes a file of its own beside the table."""
+
+    def __init__(self, folder, frames=0, settings=None):
+        super().__init__(folder, frames, settings)
+        self.path = folder / "metrics.jsonl"
+        self.file = self._file = self.path.open("a")
+
+    def log(self, metrics, frames):
+        super().log(metrics, frames)
+        self.file.write(json.dumps({"frames": frames, **metrics}) + "\n")
+
+    def close(self):
+        super().close()
+        self.file.close()
+
+
+def test_a_logger_with_a_file_of_its_own(tmp_path, caplog):
+    logger, rows = JsonLines(tmp_path), [{"a": 1.0}, {"a": 2.0, "b": 5.0}]
+    for number, row in enumerate(rows, start=1):
+        logger.log(row, number)
+    logger.close()
+    written = [{"frames": number, **row} for number, row in enumerate(rows, start=1)]
+    assert read_csv(tmp_path / "metrics.csv") == written and not caplog.records
+    assert [json.loads(line) for line in logger.path.read_text().splitlines()] == written
 
 
 def test_a_resumed_table_has_the_same_bytes(tmp_path):
