@@ -143,7 +143,7 @@ class Filling:
             volume: of the container, mm^3.
         """
         self.recording.ending = Failure.STUCK if self.left else Failure.NONE
-        self.recording.occupancy = sum(math.prod(each.size) for each in self.items) / volume
+        self.recording.occupancy = math.fsum(math.prod(each.size) for each in self.items) / volume  # in any sequence
         return PackedContainer(self.items, self.recording), self.left
 
 

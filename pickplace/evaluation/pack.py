@@ -38,6 +38,9 @@ CELL_MARGIN = 20.0  # the same for the cells that it takes, mm; large, as piles 
 #: Orientations of an item on each face on which it may lie, as it lies and turned by 90 degrees; first the upright one.
 FACES = tuple(zip(ORIENTATIONS[::2], ORIENTATIONS[1::2], strict=True))
 
+#: The usual planner, which builds towers, as it minimises gaps; and one that does not.
+PLANNER, LOW_PLANNER = "heightmap_minimisation", "joint_dbl"
+
 #: Sequences that are tried: largest base first, largest volume first, greatest height first. If some item has a load
 #: limit, also each of these with the greatest limits first.
 SEQUENCES: tuple[Callable[[OrderItem], float], ...] = (
@@ -66,7 +69,8 @@ class OrderPacker:
     Args:
         container: length, width and height, mm; a strip narrower than a cell at the far walls stays empty.
         cell: side of a cell of the grid, mm, at most :data:`MAX_CELL`.
-        planner: name of the planner that chooses places, such as ``"joint_dbl"``; it must need no training.
+        planner: name of the planner that chooses places, such as ``"joint_dbl"``; it must need no training. None:
+            :data:`PLANNER`, and :data:`LOW_PLANNER` for a container that takes all that is left, if its pile is lower.
         tipping: whether to put items down on another side, too, if they allow it.
 
     Raises:
@@ -77,7 +81,7 @@ class OrderPacker:
         self,
         container: tuple[int, int, int],
         cell: int = 20,
-        planner: str = "heightmap_minimisation",
+        planner: str | None = None,
         tipping: bool = False,
     ):
         whole_number("cell", cell, most=MAX_CELL)
@@ -92,12 +96,14 @@ class OrderPacker:
         self._settings: dict[str, Any] = {
             "gripper": Overlap(size=(1, 1)), "rotations": 2, "height_unit": 1 / cell, "cell_size": cell / 1000,
         }  # fmt: skip
-        is_known = planner in names_at("planner") or "." in planner
-        if not is_known or not _packs(find("planner", planner)):
+        self._name = PLANNER if planner is None else planner
+        is_known = self._name in names_at("planner") or "." in self._name
+        if not is_known or not _packs(find("planner", self._name)):
             names = [name for name in names_at("planner") if _packs(find("planner", name))]
-            own = "a class of your own that needs no training"
+            own = f"a subclass of {MapPlanner.__module__}.MapPlanner that needs no training"
             raise ValueError(f"planner={planner}: expected {', '.join(names)}, or {own}.")
-        self._make, self._name = find("planner", planner), planner
+        self._make = find("planner", self._name)
+        self._make_low = find("planner", LOW_PLANNER) if planner is None else None
 
     def pack(self, items: Sequence[OrderItem], keep_sequence: bool = False) -> tuple[CellSpec, list[PackedContainer]]:
         """Return the cell and the containers that hold all items, as many as are needed.
@@ -117,6 +123,8 @@ class OrderPacker:
             faces = [self._faces, self._faces[:1]] if len(self._faces) > 1 else [self._faces]
             tries = [*product([left] if keep_sequence else _sequences(left), faces)]
             tried = self._fill(cell, planner, tries, len(containers))
+            if self._make_low and not all(others for _, others in tried):
+                tried += self._fill(cell, self._make_low(cell), tries, len(containers))
             # The most items, of these the greatest volume, of these the lowest pile.
             best, left = min(tried, key=lambda each: (len(each[1]), -each[0].occupancy, each[0].top))
             refuse_if(
@@ -212,14 +220,21 @@ class OrderPacker:
         surface = torch.full((len(tries), *cell.tote_size[:2]), EMPTY, dtype=torch.int32)
         height = torch.full((len(tries),), cell.tote_size[2])
         pile = Pile.empty(len(tries), cell.tote_size, cell.pile_room) if cell.handling else None
+        # The kinds of items that found no place since the last one that did.
+        placeless: list[set[tuple]] = [set() for _ in tries]
         for items in zip(*(sequence for sequence, _ in tries), strict=True):
+            if all(item.kind in kinds for (_, item), kinds in zip(items, placeless, strict=True)):
+                for fill, each in zip(fills, items, strict=True):
+                    fill.left.append(each)
+                continue
             variants = [self._variants(item, faces) for (_, item), (_, faces) in zip(items, tries, strict=True)]
             state = State(surface, height, _in_bins(cell, variants), pile=pile)
             maps = placing_maps(cell, state)
             on_one = _allow_places_on_one(fills, items, variants, state, maps)
             if (maps.top == NEVER).all():
-                for fill, each in zip(fills, items, strict=True):
+                for fill, each, kinds in zip(fills, items, placeless, strict=True):
                     fill.left.append(each)
+                    kinds.add(each[1].kind)
                 continue
             action = planner.choose(cell, state, maps, {})
             turns, alone = _turns_on_one(cell, state, action, on_one)
@@ -232,7 +247,9 @@ class OrderPacker:
             for row, move in enumerate(record_moves(cell, None, None, state, action, step)):
                 if move.failure:
                     fills[row].left.append(items[row])
+                    placeless[row].add(items[row][1].kind)
                     continue
+                placeless[row].clear()
                 face = variants[row][int(step.taken[row])][0]
                 move = replace(move, rotation=(turn := turns[row]))
                 fills[row].put_down(items[row], face[turn], move, heights[row], bearing[row])

@@ -56,8 +56,9 @@ def parser() -> argparse.ArgumentParser:
                 "help": "put items down on another side, too, unless their column orientations forbids it",
             },
             "--planner": {
-                "metavar": "NAME", "default": "heightmap_minimisation",
-                "help": "what chooses the places: best_fit, corner, joint_dbl, ... (default %(default)s)",
+                "metavar": "NAME",
+                "help": "what chooses the places: best_fit, corner, joint_dbl, ... (default: heightmap_minimisation, "
+                "and joint_dbl where that makes the last pile lower)",
             },
             "--out": {
                 "metavar": "FOLDER", "default": "outputs/pack", "help": "where the files go (default %(default)s)",
@@ -84,7 +85,8 @@ def run(args: argparse.Namespace) -> None:
     from pickplace.physics.plans import PLANS, EpisodePlan, to_lines
     from pickplace.views.replay import page
 
-    orders = read_orders(args.order, one_of("--unit", args.unit, MILLIMETRES), key="order")
+    notes: list[str] = []
+    orders = read_orders(args.order, one_of("--unit", args.unit, MILLIMETRES), key="order", note=notes.append)
     packer = OrderPacker(container, args.cell, args.planner, args.tipping)
     for order in orders:  # before the first of them is packed
         packer.check(order.items)
@@ -120,7 +122,8 @@ def run(args: argparse.Namespace) -> None:
         old.unlink()
     shown = " to ".join(dict.fromkeys((files[0], files[-1])))
     # After the files: a reader that ends early, such as head, must not cost the plan.
-    write_output("".join([*tables, f"{folder}: plan.csv, plan.json, {PLANS}, {shown}\n"]))
+    notes = [f"{note}\n" for note in notes]
+    write_output("".join([*tables, *notes, f"{folder}: plan.csv, plan.json, {PLANS}, {shown}\n"]))
 
 
 def _free_names(name: str, count: int, taken: Container[str]) -> tuple[str, list[str]]:
@@ -144,7 +147,8 @@ def _row(name: str, container: int, step: int, packed: "PackedItem") -> dict:
 
 def _text(name: str, place: int, count: int, container: "PackedContainer", rows: list[dict]) -> str:
     """Return the text that is printed for a container."""
-    weight, top = sum(row["weight/kg"] for row in rows), math.ceil(10 * container.top - 1e-6) / 10
+    weight = sum(packed.item.grams for packed in container.items) / 1000
+    top = math.ceil(10 * container.top - 1e-6) / 10
     lines = [
         f"{name}, container {place} of {count}: {len(rows)} item{'s' * (len(rows) != 1)}, "
         f"{container.occupancy:.1%} of its volume, {weight:,.1f} kg, {top:g} mm high"

@@ -3,10 +3,10 @@
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from pickplace.common.files import MAX_TABLE_BYTES, csv_rows, read_text
 from pickplace.common.validate import excerpt, expect, refuse_above, refuse_if, reword_errors, unique_keys
@@ -134,7 +134,9 @@ class _Column(NamedTuple):
         return "a number"
 
 
-def read_orders(path, unit: str = "mm", key: str = "items.path", target: str | None = None) -> list[Order]:
+def read_orders(
+    path, unit: str = "mm", key: str = "items.path", target: str | None = None, note: Callable[[str], Any] | None = None
+) -> list[Order]:
     """Return the orders of a file.
 
     A CSV has a header and a line for each item, or for each article with its ``quantity``. Commas, semicolons or tabs
@@ -152,6 +154,7 @@ def read_orders(path, unit: str = "mm", key: str = "items.path", target: str | N
         key: the setting that names the file.
         target: return only the orders with this value in the column ``target``, or in ``properties`` of BED-BPP; None:
             all.
+        note: gets a sentence on columns that are not read, if there are any.
 
     Raises:
         ValueError: naming the file, and the line of a value that cannot be used.
@@ -165,10 +168,13 @@ def read_orders(path, unit: str = "mm", key: str = "items.path", target: str | N
     orders: dict[str, list[OrderItem]] = {}
     articles: dict[str, OrderItem] = {}  # by id
     columns: dict[tuple[str, ...], dict[str, _Column]] = {}
+    unread: dict[str, None] = {}
     total, targets = 0, dict[str, None]()
     for place, header, values, header_place, decimal in rows:
         if header not in columns:
             columns[header] = _read_header(f"{path}, {header_place}", header, unit, decimal)
+            used = {column.key for column in columns[header].values()}
+            unread |= dict.fromkeys(name for name in header if name and name not in used)
         row = dict(zip(header, values, strict=True))
         item, order, quantity = _read_row(f"{path}, {place}", row, columns[header])
         known = articles.setdefault(item.id, item)
@@ -187,6 +193,8 @@ def read_orders(path, unit: str = "mm", key: str = "items.path", target: str | N
     refuse_if(not orders, f"{path}: no items{words}, expected at least one.")
     if len(orders) > 1 and "" in orders:
         raise ValueError(f"{orders[''][0].place}: its order has no name; expected one in each line, or in none.")
+    if unread and note:
+        note(f"{path}: not read: {', '.join(map(_printable, unread)):.500}.")
     return [Order(_printable(name), items) for name, items in orders.items()]
 
 
@@ -244,7 +252,8 @@ def _rows_of_json(path: Path, text: str) -> Iterator[_Row]:
         for number in sorted(items, key=int):
             if not isinstance(items[number], dict):
                 raise wrong(f"order {excerpt(name)}, item {number} is {excerpt(items[number])}")
-            own = {key: value for key, value in items[number].items() if _name_and_unit(key)[0] not in NAMES["order"]}
+            twice = {*NAMES["order"], "sequence"}
+            own = {key: value for key, value in items[number].items() if _name_and_unit(key)[0] not in twice}
             place, entries = f"order {_printable(name)}, item {number}", {**about, **own, "order": name}
             yield _Row(place, tuple(entries), tuple(entries.values()), place)
 
@@ -270,20 +279,27 @@ def _read_header(place: str, header: Sequence, unit: str, decimal: str) -> dict[
     # In l,w,h and length,width,height the width is the second side; in w,d,h and width,depth,height the first.
     is_second = {"length", "l"} & {*found} or not {"d", "depth"} & {*found}
     names_of = NAMES if is_second else NAMES | {"length": ("w", "width"), "width": ("d", "depth")}
-    columns = {}
+    columns: dict[str, _Column] = {}
+    unitless = []
     for column, names in names_of.items():
         given = [name for name in names if name in found]
         refuse_if(len(given) > 1, f"{place}: columns {' and '.join(map(excerpt, given))}; expected one of them.")
         for name in given:
             key, suffix = found[name]
             units = UNITS.get(column, {None: 1.0})
-            default = name if name in units else unit if column in SIDES else DEFAULT_WEIGHT
-            value = suffix or default if column in UNITS else None
+            suffix = suffix or (name if name in units else None)
+            value = suffix or (unit if column in SIDES else DEFAULT_WEIGHT) if column in UNITS else None
             refuse_if(
                 value not in units,
                 f"{place}: the column {excerpt(key)} is in {value}; expected {' or '.join(map(str, units))}.",
             )
             columns[column] = _Column(key, units[value], decimal)
+            unitless += [] if suffix else [column]
+    for group in SIDES, ("weight", "max_load"):
+        units_of = {column: columns[column].unit for column in group if column in columns}
+        for column in [column for column in unitless if column in units_of and len({*units_of.values()}) > 1]:
+            key = excerpt(columns[column].key)
+            raise ValueError(f"{place}: the column {key} has no unit, but others have one; expected one in each.")
     for column, key in similar.items():
         in_units = " in g or kg" if column in UNITS else ""
         refuse_if(

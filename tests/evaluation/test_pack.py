@@ -7,7 +7,9 @@ import math
 import random
 import shutil
 import sys
+from itertools import product
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from omegaconf import OmegaConf
 from scipy.spatial import ConvexHull
 
 from pickplace.common.validate import refuse_if
+from pickplace.evaluation import pack as packing
 from pickplace.evaluation import pack_command
 from pickplace.evaluation.pack import OrderPacker
 from pickplace.items.order_file import ORIENTATIONS, OrderItem
@@ -168,16 +171,36 @@ def test_the_first_container_is_the_best_of_the_sequences_one_by_one(sizes, tipp
         lambda item: -item.height,
     )
     alone = []
-    for key in keys:
-        for tipped in {tipping, False}:
-            packer = OrderPacker(CONTAINER, CELL, tipping=tipped)
-            alone.append(packer.pack(sorted(items, key=key), keep_sequence=True)[1][0])
+    for planner in ("heightmap_minimisation", "joint_dbl"):
+        if not alone or any(len(each.items) == len(items) for each in alone):
+            for key, tipped in product(keys, [True, False] if tipping else [False]):
+                packer = OrderPacker(CONTAINER, CELL, planner, tipped)
+                alone.append(packer.pack(sorted(items, key=key), keep_sequence=True)[1][0])
     _, (together, *_) = OrderPacker(CONTAINER, CELL, tipping=tipping).pack(items)
     best = min(alone, key=lambda each: (-len(each.items), -each.occupancy, each.top))
     found, expected = (
         [(packed.item.id, packed.corner, packed.orientation) for packed in each.items] for each in (together, best)
     )
     assert found == expected
+
+
+def test_what_is_left_lies_on_the_floor_if_there_is_room():
+    """The heuristic that minimises gaps would build a tower of five."""
+    items = [OrderItem("box", 270.0, 390.0, 262.0, 9, "line 1")] * 6
+    _, (one,) = OrderPacker((1200, 800, 1500), CELL).pack(items)
+    assert one.top == 262 and all_carried(one.items)
+    _, (tower,) = OrderPacker((1200, 800, 1500), CELL, "heightmap_minimisation").pack(items)
+    assert tower.top == 5 * 262
+
+
+def test_equal_items_are_not_tried_again_in_a_full_container(monkeypatch):
+    """With two kinds, a container costs a try for each item in it, and few more."""
+    tried = Mock(side_effect=packing.placing_maps)
+    monkeypatch.setattr(packing, "placing_maps", tried)
+    kinds = [OrderItem("a", 100.0, 80.0, 60.0, 9, "line 1"), OrderItem("b", 90.0, 80.0, 50.0, 9, "line 2")]
+    _, containers = OrderPacker((200, 100, 120), CELL, "joint_dbl").pack([kinds[n % 2] for n in range(60)])
+    assert sum(len(each.items) for each in containers) == 60 and len(containers) >= 10
+    assert tried.call_count <= 60 + 6 * len(containers)
 
 
 @pytest.mark.parametrize("planner", ["joint_dbl", "best_fit", "individual_heuristic"])
@@ -467,6 +490,22 @@ def test_a_second_container_takes_what_is_left(pack, tmp_path):
 def test_bad_words_are_refused_in_one_sentence(pack, words, message):
     err, _ = pack(ORDERS, *words, code=2)
     assert message in err and err.count("\n") == 1
+
+
+def test_columns_that_are_not_read_are_named(pack, tmp_path):
+    (path := tmp_path / "a.csv").write_text("l,w,h,kg,fragile,amount,,note\n200,300,200,1,yes,3,,\n")
+    _, out = pack(path, "--container", "400x300x250")
+    assert f"\n{path}: not read: fragile, amount, note.\n" in out
+    _, out = pack(ORDERS, "--container", "300x300x250")
+    assert "not read" not in out
+
+
+def test_a_planner_of_the_user(pack, monkeypatch):
+    monkeypatch.syspath_prepend(str(ORDERS.parents[1] / "own_planner"))
+    words = ["--container", "300x300x250", "--planner", "own_planner.SoftDBL"]
+    assert (
+        "or a subclass of pickplace.planners.base.MapPlanner that needs no training" in pack(ORDERS, *words, code=2)[0]
+    )
 
 
 def test_the_lines_that_fit_no_container_are_counted(pack, tmp_path):

@@ -141,7 +141,7 @@ def test_an_order_without_a_name_among_others_is_refused(tmp_path):
 
 
 def test_sizes_are_equal_in_any_unit(tmp_path):
-    (path := tmp_path / "a.csv").write_text("l/m,w/cm,h,kg\n1.003,100.3,69,1\n")
+    (path := tmp_path / "a.csv").write_text("l/m,w/cm,h/mm,kg\n1.003,100.3,69,1\n")
     assert read_orders(path)[0].items[0][1:4] == (1003, 1003, 69)
 
 
@@ -292,6 +292,26 @@ def test_an_item_that_fits_nowhere_is_named_with_its_line(tmp_path):
 def test_names_of_sides(tmp_path, header, sides):
     (path := tmp_path / "a.csv").write_text(f"\n{header},kg,,\n1,2,3,4,,\n")
     assert read_orders(path)[0].items[0][1:4] == sides
+
+
+@pytest.mark.parametrize(
+    ("header", "column"),
+    [
+        ("length/cm,width,height,weight", "width"), ("length,width,height (cm),weight", "length"),
+        ("length/mm,width/cm,height,weight", "height"), ("l,w,h,g,max_load", "max_load"),
+        ("l,w,h,weight,max_load/g", "weight"),
+    ],
+)  # fmt: skip
+def test_units_that_are_given_in_part_are_refused(tmp_path, header, column):
+    (path := tmp_path / "a.csv").write_text(f"{header}\n1,2,3,4{',5' * (header.count(',') - 3)}\n")
+    with pytest.raises(ValueError, match=f"a.csv, line 1: the column '{column}' has no unit, but others have one; exp"):
+        read_orders(path)
+
+
+def test_units_that_are_given_in_part_and_are_the_usual_ones(tmp_path):
+    (path := tmp_path / "a.csv").write_text("length/mm,width,h,kg,max_load\n1,2,3,4,5\n")
+    ((item,),) = (order.items for order in read_orders(path))
+    assert (item[1:5], item.max_load) == ((1, 2, 3, 4000), 5000)
 
 
 def test_boxes_of_robobpp(tmp_path):
