@@ -38,7 +38,7 @@ CELL_MARGIN = 20.0  # the same for the cells that it takes, mm; large, as piles 
 #: Orientations of an item on each face on which it may lie, as it lies and turned by 90 degrees; first the upright one.
 FACES = tuple(zip(ORIENTATIONS[::2], ORIENTATIONS[1::2], strict=True))
 
-#: The usual planner, which builds towers, as it minimises gaps; and one that does not.
+#: The default planner minimises gaps, so it may build towers; the other one keeps piles low.
 PLANNER, LOW_PLANNER = "heightmap_minimisation", "joint_dbl"
 
 #: Sequences that are tried: largest base first, largest volume first, greatest height first. If some item has a load
@@ -220,7 +220,7 @@ class OrderPacker:
         surface = torch.full((len(tries), *cell.tote_size[:2]), EMPTY, dtype=torch.int32)
         height = torch.full((len(tries),), cell.tote_size[2])
         pile = Pile.empty(len(tries), cell.tote_size, cell.pile_room) if cell.handling else None
-        # The kinds of items that found no place since the last one that did.
+        # Of each try: the kinds of items that found no place since an item was last put down.
         placeless: list[set[tuple]] = [set() for _ in tries]
         for items in zip(*(sequence for sequence, _ in tries), strict=True):
             if all(item.kind in kinds for (_, item), kinds in zip(items, placeless, strict=True)):

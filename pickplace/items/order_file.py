@@ -154,7 +154,7 @@ def read_orders(
         key: the setting that names the file.
         target: return only the orders with this value in the column ``target``, or in ``properties`` of BED-BPP; None:
             all.
-        note: gets a sentence on columns that are not read, if there are any.
+        note: called with a sentence that lists the columns that are not read, if there are any.
 
     Raises:
         ValueError: naming the file, and the line of a value that cannot be used.
@@ -252,8 +252,8 @@ def _rows_of_json(path: Path, text: str) -> Iterator[_Row]:
         for number in sorted(items, key=int):
             if not isinstance(items[number], dict):
                 raise wrong(f"order {excerpt(name)}, item {number} is {excerpt(items[number])}")
-            twice = {*NAMES["order"], "sequence"}
-            own = {key: value for key, value in items[number].items() if _name_and_unit(key)[0] not in twice}
+            repeated = {*NAMES["order"], "sequence"}
+            own = {key: value for key, value in items[number].items() if _name_and_unit(key)[0] not in repeated}
             place, entries = f"order {_printable(name)}, item {number}", {**about, **own, "order": name}
             yield _Row(place, tuple(entries), tuple(entries.values()), place)
 

@@ -203,7 +203,7 @@ def test_equal_items_are_not_tried_again_in_a_full_container(monkeypatch):
     assert tried.call_count <= 60 + 6 * len(containers)
 
 
-def test_an_item_that_found_no_place_makes_no_equal_one_wait():
+def test_an_equal_item_is_tried_again_once_another_one_is_placed():
     """A plate lies on two cubes, not on one."""
     cube, plate = (OrderItem(str(h), side, 100.0, h, 9, "line 1") for side, h in ((100.0, 100.0), (200.0, 30.0)))
     _, (first, second) = OrderPacker((200, 100, 130), CELL).pack([cube, plate, cube, plate], keep_sequence=True)
