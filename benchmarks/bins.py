@@ -1,20 +1,21 @@
 """Measure what a choice among several items gains: python benchmarks/bins.py
 
-Plays the test stream with 1 to 10 items to choose from, and with one item and previews of the next ones. Writes
-docs/results/bins.csv and docs/results/bins.png, and prints a table. outputs/bins keeps what was played, so that it is
-not played again. ``python benchmarks/bins.py gopt_rs`` plays only this task, so that several processes can share the
-work; the table and the figure then wait for the others. Delete outputs/bins after a change of what is played.
+Plays the test stream with 1 to 10 items to choose from, and with one item and previews of the next ones.
+docs/results/bins.csv keeps what was measured, and bins.png beside it draws this. What is there is not played again.
+``python benchmarks/bins.py mixed`` plays only this task, so that several processes can share the work.
 """
 
-import csv
 import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
 from typing import NamedTuple
 
-from common import ROOT, evaluate
+from common import ROOT, append_rows, evaluate, read_rows
 
 from pickplace.views.figures import COLOURS, INK, figure_of
 
-RESULTS, RUNS = ROOT / "docs" / "results", ROOT / "outputs" / "bins"
+TABLE = ROOT / "docs" / "results" / "bins.csv"
 EPISODES = 100  # of all methods but values
 
 
@@ -44,61 +45,87 @@ METHODS = {
     "best_fit": ("best_fit", ("planner=best_fit",)),
     "joint_dbl": ("joint_dbl", ("planner=joint_dbl",)),
 }
-COLUMNS = ("task", "bin_items", "preview", "method", "episodes", "mean", "low", "high", "settle_keeps", "ms")
 
 
-def measure(name: str, count: int, preview: int, method: str) -> dict:
+class Cell(NamedTuple):
+    """A method with one task; the first columns of the table."""
+
+    task: str
+    bin_items: int
+    preview: int
+    method: str
+
+    @property
+    def words(self) -> list[str]:
+        """For pickplace-evaluate."""
+        task, count, preview = TASKS[self.task], self.bin_items, self.preview
+        episodes = task.episodes if self.method == "values" else EPISODES
+        words = [*task.words, f"env.bin_items={count}", f"env.preview={preview}", f"evaluation.episodes={episodes}"]
+        words += [f"env.bin_size={task.bin_size}"] if count > 1 else []
+        words += [f"planner.depth={preview + 1}"] if preview else []  # looks at all of them
+        return [*words, *METHODS[self.method][1]]
+
+
+def cells(names: list[str]) -> Iterator[Cell]:
+    """Yield what is played of some tasks."""
+    for name in names:
+        task = TASKS[name]
+        yield from (Cell(name, count, 0, method) for count in task.counts for method in METHODS)
+        yield from (Cell(name, 1, preview, "beam") for preview in task.previews)
+
+
+def play(cell: Cell) -> dict:
     """Return a row of the table."""
-    task = TASKS[name]
-    episodes = task.episodes if method == "values" else EPISODES
-    words = [*task.words, f"env.bin_items={count}", f"env.preview={preview}", f"evaluation.episodes={episodes}"]
-    words += [f"env.bin_size={task.bin_size}"] if count > 1 else []
-    words += [f"planner.depth={preview + 1}"] if preview else []  # looks at all of them
-    result = evaluate(RUNS / f"{name}-{count}-{preview}-{method}", *words, *METHODS[method][1])
+    with tempfile.TemporaryDirectory() as folder:
+        result = evaluate(Path(folder, "run"), *cell.words)
     occupancy, physics = result["occupancy"], result.get("physics")
-    row = {"task": name, "bin_items": count, "preview": preview, "method": method, "episodes": result["episodes"]}
+    row = {**cell._asdict(), "episodes": result["episodes"]}
     row |= {"mean": occupancy["mean"], "low": occupancy["ci95"][0], "high": occupancy["ci95"][1]}
     return row | {"settle_keeps": physics and physics["carried_out"]["mean"], "ms": result["latency_ms"]["p50"]}
 
 
-def draw(rows: list[dict]) -> None:
+def read() -> dict[Cell, dict]:
+    """Return what was measured."""
+    rows = {}
+    for row in read_rows(TABLE):
+        cell = Cell(row["task"], int(row["bin_items"]), int(row["preview"]), row["method"])
+        rows[cell] = {key: float(row[key]) for key in ("mean", "low", "high")}
+    return rows
+
+
+def draw() -> None:
     """Draw the occupancy over the number of items to choose from, with intervals; an area for each task."""
+    rows = read()
+    names = [name for name in TASKS if any(cell.task == name for cell in rows)]
     figure = figure_of(10, 4)
-    areas = figure.subplots(1, len(TASKS), sharey=True)
-    for axes, (name, task) in zip(areas, TASKS.items(), strict=True):
+    areas = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
+    for axes, name in zip(areas, names, strict=True):
         for colour, (method, (label, _)) in zip(COLOURS, METHODS.items(), strict=False):
-            line = [row for row in rows if (row["task"], row["method"], row["preview"]) == (name, method, 0)]
-            counts, means = [row["bin_items"] for row in line], [row["mean"] for row in line]
+            counts = [count for count in TASKS[name].counts if Cell(name, count, 0, method) in rows]
+            line = [rows[Cell(name, count, 0, method)] for count in counts]
             errors = [[row["mean"] - row["low"] for row in line], [row["high"] - row["mean"] for row in line]]
             style = "-" if method in ("beam", "values") else "--"
+            means = [row["mean"] for row in line]
             axes.errorbar(counts, means, errors, label=label, color=colour, marker="o", ls=style, capsize=3)
-        axes.set_title(task.label, fontsize=10)
-        axes.set_xticks(task.counts)
+        axes.set_title(TASKS[name].label, fontsize=10)
+        axes.set_xticks(TASKS[name].counts)
         axes.set_xlabel("items to choose from")
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
         axes.tick_params(colors=INK)
     areas[0].set_ylabel("occupancy, mean and 95% interval")
     figure.legend(*areas[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
-    figure.savefig(RESULTS / "bins.png", dpi=120)
+    figure.savefig(TABLE.with_suffix(".png"), dpi=120)
 
 
 def main(names: list[str]) -> None:
     if unknown := {*names} - {*TASKS}:
         sys.exit(f"unknown task {min(unknown)}; expected one of {', '.join(TASKS)}")
-    rows = []
-    for name in names or TASKS:
-        task = TASKS[name]
-        rows += [measure(name, count, 0, method) for count in task.counts for method in METHODS]
-        rows += [measure(name, 1, preview, "beam") for preview in task.previews]
-    if names:
-        return
-    with (RESULTS / "bins.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows({key: round(v, 4) if isinstance(v, float) else v for key, v in row.items()} for row in rows)
-    draw(rows)
-    sys.stdout.write((RESULTS / "bins.csv").read_text())
+    known = read()
+    for cell in cells(names or [*TASKS]):
+        if cell not in known:
+            append_rows(TABLE, [play(cell)])
+    draw()
 
 
 if __name__ == "__main__":

@@ -1,5 +1,8 @@
-"""Helpers of the benchmarks: run commands, use one core, time functions in turn, compute percentiles, save results."""
+"""Helpers of the benchmarks: run commands, keep rows, use one core, time functions in turn, save results."""
 
+import csv
+import fcntl
+import io
 import json
 import os
 import platform
@@ -8,6 +11,7 @@ import statistics
 import subprocess
 import sys
 import time
+from collections.abc import Iterable
 from pathlib import Path
 
 # Waiting threads spin, here and in the commands, as the machine is idle. OpenMP reads this when torch is loaded.
@@ -42,6 +46,24 @@ def evaluate(folder: Path, *words: str) -> dict:
     if not path.is_file():
         run("pickplace-evaluate", *words, "evaluation.replay=0", "threads=1", f"hydra.run.dir={folder}")
     return json.loads(path.read_text())
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """Return the rows of a CSV file; none without the file."""
+    return list(csv.DictReader(path.open(newline=""))) if path.is_file() else []
+
+
+def append_rows(path: Path, rows: Iterable[dict]) -> None:
+    """Add rows to a CSV file, to which other processes may add some, too; a new file begins with its columns' names."""
+    path.parent.mkdir(exist_ok=True)
+    with path.open("a", newline="") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        for row in rows:
+            writer = csv.DictWriter(file, row, lineterminator="\n")
+            if file.seek(0, io.SEEK_END) == 0:
+                writer.writeheader()
+            writer.writerow({key: round(v, 5) if isinstance(v, float) else v for key, v in row.items()})
+            file.flush()
 
 
 def interleave(functions: dict, repeats: int, warmup: int = 2) -> dict[str, dict[str, float]]:

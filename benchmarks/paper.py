@@ -8,9 +8,6 @@ outputs/paper, which has the run folders: stopped trainings there go on, and fin
 ``python benchmarks/paper.py fcn4d-R4-0`` trains and plays only this, so that several processes can share the work.
 """
 
-import csv
-import fcntl
-import io
 import sys
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
@@ -19,7 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from common import ROOT, evaluate, run, write_tables
+from common import ROOT, append_rows, evaluate, read_rows, run, write_tables
 from matplotlib.ticker import EngFormatter
 from scipy.stats import t
 
@@ -119,24 +116,6 @@ def heuristic_cells() -> Iterator[Cell]:
         if turns == 4 or tote not in LARGE:
             yield Cell(method, turns, tote)
     yield from (Cell("mcts", 4, tote) for tote in SMALL[:3])
-
-
-def read_rows(path: Path) -> list[dict[str, str]]:
-    """Return the rows of a file; none without the file."""
-    return list(csv.DictReader(path.open(newline=""))) if path.is_file() else []
-
-
-def append_rows(path: Path, rows: Iterable[dict]) -> None:
-    """Add rows to a file, to which other processes may add some, too; a new file begins with its columns' names."""
-    RESULTS.mkdir(exist_ok=True)
-    with path.open("a", newline="") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        for row in rows:
-            writer = csv.DictWriter(file, row, lineterminator="\n")
-            if file.seek(0, io.SEEK_END) == 0:
-                writer.writeheader()
-            writer.writerow({key: round(v, 5) if isinstance(v, float) else v for key, v in row.items()})
-            file.flush()
 
 
 def read_episodes() -> dict[Cell, list[float]]:
