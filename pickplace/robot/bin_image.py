@@ -49,11 +49,14 @@ def find_boxes(
         DepthMapError,
     )
     surface = seen.surface(room)
-    segments = _segments(seen, above, accuracy, labels)
+    reach = 1 if labels is not None else _step_reach(seen, room, accuracy, greatest)
+    segments = _segments(seen, above, accuracy, reach, labels)
     numbers, counts = np.unique(segments[segments > 0], return_counts=True)
     boxes, floor, free = [], seen.points_at_height(0.0), np.ones_like(seen.holes)
     for number in numbers[counts >= MIN_ITEM_PIXELS]:
-        box, seen_top = _read_box(seen, room, margin, surface, segments, number, above, accuracy, labels is None)
+        box, seen_top = _read_box(
+            seen, room, margin, surface, segments, number, above, accuracy, reach if labels is None else 0
+        )
         boxes.append(box)
         if not isinstance(box, UnknownBox):
             free &= ~is_inside(floor, *seen_top)
@@ -76,13 +79,30 @@ def find_boxes(
     return boxes
 
 
-def _segments(seen: Heights, above: np.ndarray, accuracy: float, labels: np.ndarray | None) -> np.ndarray:
-    """Return the number of the item that each pixel shows, 0 for none."""
+def _step(seen: Heights, accuracy: float) -> float:
+    """Return the least difference of heights that parts two items, m."""
+    return 4 * accuracy + seen.pixel
+
+
+def _step_reach(seen: Heights, room: Room, accuracy: float, greatest: float) -> int:
+    """Return the number of pixels on each side within which a step of the height is looked for.
+
+    A camera that looks at an item from the side also sees its side, whose pixels are lower the further out they are.
+    The reach is so long that any side has the whole step within it, with a quarter more for noise.
+    """
+    way = seen.origin[2] - greatest  # down to the highest item, where the pixels are smallest
+    slant = float(np.linalg.norm(room.corners - seen.origin[:2], axis=1).max()) / way
+    pixel = seen.pixel * way / seen.origin[2]
+    return max(1, math.ceil(1.25 * _step(seen, accuracy) * slant / (2 * pixel)))
+
+
+def _segments(seen: Heights, above: np.ndarray, accuracy: float, reach: int, labels: np.ndarray | None) -> np.ndarray:
+    """Return the number of the item that each pixel shows, 0 for none; see :func:`_step_reach`."""
     if labels is None:
-        known = ~np.isnan(seen.height)
-        high = ndimage.maximum_filter(np.where(known, seen.height, -np.inf), 3)
-        low = ndimage.minimum_filter(np.where(known, seen.height, np.inf), 3)
-        return ndimage.label(above & (high - low < 4 * accuracy + seen.pixel))[0]
+        known, width = ~np.isnan(seen.height), 2 * reach + 1
+        high = ndimage.maximum_filter(np.where(known, seen.height, -np.inf), width)
+        low = ndimage.minimum_filter(np.where(known, seen.height, np.inf), width)
+        return ndimage.label(above & (high - low < _step(seen, accuracy)))[0]
     named = ndimage.binary_dilation(labels > 0, EIGHT_NEIGHBOURS, iterations=2)
     if (left := above & ~named).sum() >= MIN_ITEM_PIXELS:
         row, column = np.argwhere(left)[0].tolist()
@@ -95,7 +115,7 @@ def _segments(seen: Heights, above: np.ndarray, accuracy: float, labels: np.ndar
 
 def _read_box(
     seen: Heights, room: Room, margin: float, surface: np.ndarray, segments: np.ndarray, number: int,
-    above: np.ndarray, accuracy: float, narrowed: bool,
+    above: np.ndarray, accuracy: float, narrowed: int,
 ) -> tuple[Box, tuple]:  # fmt: skip
     """Return the cuboid whose top fills a segment, and the seen part of its top: centre, sides and yaw.
 
@@ -104,15 +124,18 @@ def _read_box(
     Args:
         margin: width of the border along the walls in which no top is seen, m.
         surface: see :meth:`Heights.surface`.
-        narrowed: whether the filter of steps removed the outermost pixels of the segment; False if labels made it.
+        narrowed: number of the segment's outermost pixels that the search for steps removed; 0 if labels made it.
     """
     top, band = segments == number, level_range(accuracy)
     height = float(np.quantile(seen.height[top], 0.95))
     if narrowed:
-        near = ndimage.binary_dilation(top, EIGHT_NEIGHBOURS) & above & (segments == 0)
-        top = top | (near & (np.abs(seen.height - height) <= band))
+        level = above & (segments == 0) & (np.abs(seen.height - height) <= band)
+        # As far again, for the corners of a turned item, into which the square of the search does not fit.
+        top = ndimage.binary_dilation(top, EIGHT_NEIGHBOURS, iterations=2 * narrowed - 1, mask=level | top)
     points, pixel = seen.points_at_height(height), seen.pixel * (seen.origin[2] - height) / seen.origin[2]
-    x, y, w, d, yaw = smallest_rectangle(points[top])
+    # A pixel that is lower than the error of a height allows shows the item's side, so its own place is nearer.
+    places = seen.points_at_height(np.fmin(height, seen.height + accuracy))
+    x, y, w, d, yaw = smallest_rectangle(places[top])
     _check_top(seen, (x, y, w, d, yaw), points, top, pixel, accuracy)
     # Each side may be as far out as the first ray in front of it that passes the height of the top.
     known = ~np.isnan(seen.height)
@@ -135,7 +158,8 @@ def _read_box(
         return {"x": float(x + shift[0]), "y": float(y + shift[1]), "w": float(w + by[0] + by[1]),
                 "d": float(d + by[2] + by[3]), "h": height, "yaw": yaw}  # fmt: skip
 
-    error = float(max(0.0, outer.max() - pixel))
+    slant = float(np.hypot(*(seen.origin[:2] - (x, y)))) / (seen.origin[2] - height)  # the item's side seems top so far
+    error = float(max(0.0, outer.max() - pixel, accuracy * slant - pixel / 2))
     on_top = is_inside(points, (x, y), (w, d), yaw)
     if (outer <= longest).all() and not seen.holes_above(height, surface, room, accuracy, on_top).any():
         return Box(**grown(outer), edge_error=error).upright(), ((x, y), (w + 2 * pixel, d + 2 * pixel), yaw)
@@ -185,7 +209,7 @@ def _check_top(
     refuse_if(
         (slope := float(np.ptp(plane))) > 2 * accuracy,
         f"{found} has a top that slopes by {slope:.3f} m, expected a level one, {2 * accuracy:g} m at most: is it "
-        "tilted, or the camera's pose wrong?",
+        "tilted, or two items that touch, or the camera's pose wrong?",
         DepthMapError,
     )
     refuse_if(
@@ -278,12 +302,14 @@ def _check_reading(box: Box, sizes: list[tuple[float, float, float]], tolerance:
     def is_like(w: float, d: float) -> bool:
         return abs(box.w - w) <= tolerance and abs(box.d - d) <= tolerance
 
+    def side_by_side(a: tuple, b: tuple, along: int) -> bool:
+        sides = [0.0, 0.0]
+        sides[along], sides[1 - along] = a[along] + b[along], max(a[1 - along], b[1 - along])
+        return is_like(*sides) and abs(a[1 - along] - b[1 - along]) <= tolerance
+
     one = [(w, d) for w, d in tall if is_like(w, d)]
-    two = [
-        (a, b)
-        for a, b in combinations_with_replacement(tall, 2)
-        if (is_like(a[0] + b[0], a[1]) and a[1] == b[1]) or (is_like(a[0], a[1] + b[1]) and a[0] == b[0])
-    ]
+    pairs = combinations_with_replacement(tall, 2)
+    two = [(a, b) for a, b in pairs if side_by_side(a, b, 0) or side_by_side(a, b, 1)]
     found = f"depth: what lies at [{box.x:.3f}, {box.y:.3f}], {box.w:.3f} x {box.d:.3f} x {box.h:.3f} m,"
     if two:
         pair = " and ".join(f"{w:g} x {d:g}" for w, d in two[0])

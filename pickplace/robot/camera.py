@@ -106,8 +106,8 @@ class Camera:
         )
 
     def pixel(self, height: float = 0.0) -> float:
-        """Return the side of a pixel's square at a height above the floor, in metres."""
-        return (self.pose[2, 3] - height) / min(self.fx, self.fy)
+        """Return the length that a pixel shows of a level surface at a height, in the middle of the image, m."""
+        return float((self.pose[2, 3] - height) / min(self.fx, self.fy) / self.pose[2, 2] ** 2)
 
     def tote_map(
         self, depth, cell: CellSpec, cell_size: float, tote_height: float | None = None, accuracy: float = ACCURACY,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from typing_extensions import Self
 
 from pickplace.common.errors import sentence
-from pickplace.common.validate import number, refuse_above, refuse_any, refuse_if, reword_errors, unique_keys
+from pickplace.common.validate import expect, number, refuse_above, refuse_any, refuse_if, reword_errors, unique_keys
 from pickplace.robot.box import ACCURACY, CLEARANCE, Box, EmptyBinError
 from pickplace.serve.deadline import Deadline
 
@@ -165,10 +165,10 @@ def read_boxes(key: str, items) -> list[Box]:
     """Return the boxes of a request's ``items``, ``placed`` or ``coming``.
 
     Raises:
-        ValueError: naming the first box with other keys.
+        ValueError: for no list, or naming the first box with other keys.
     """
     boxes = []
-    for at, item in enumerate(items if isinstance(items, list) else [items]):
+    for at, item in enumerate(expect(isinstance(items, list), key, items, "a list of boxes")):
         try:
             boxes.append(Box(**item))
         except TypeError as error:

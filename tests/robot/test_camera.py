@@ -23,8 +23,9 @@ def camera(room=TOTE, height=1.2, focal=500.0) -> Camera:
 
 def image(eye: Camera, boxes, room=TOTE, noise=0.0, seed=0, walls=True) -> np.ndarray:
     """Distances along the optical axis to the floor, the walls around ``room`` and the boxes, each with a yaw."""
-    row, column = np.indices(SHAPE)
-    rays = np.stack([(column - eye.cx) / eye.fx, (row - eye.cy) / eye.fy, np.ones(SHAPE)], -1) @ eye.pose[:3, :3].T
+    row, column = np.indices(eye.shape)
+    rays = np.stack([(column - eye.cx) / eye.fx, (row - eye.cy) / eye.fy, np.ones(eye.shape)], -1)
+    rays = rays @ eye.pose[:3, :3].T
     origin = eye.pose[:3, 3]
     depth = -origin[2] / rays[..., 2]  # the floor
     w, d, h = room
@@ -41,7 +42,7 @@ def image(eye: Camera, boxes, room=TOTE, noise=0.0, seed=0, walls=True) -> np.nd
             ends = np.stack([(-half - start) / way, (half - start) / way])
         enter, leave = ends.min(0).max(-1), ends.max(0).min(-1)
         depth = np.where(enter < leave, np.minimum(depth, enter), depth)
-    return depth + np.random.default_rng(seed).normal(0, noise, SHAPE)
+    return depth + np.random.default_rng(seed).normal(0, noise, eye.shape)
 
 
 def box_of(size, x, y, yaw=0.0, low=0.0):
@@ -63,6 +64,28 @@ def test_an_item_is_measured(seed):
     if abs(abs(true.yaw) - 45) > 4 and box.yaw != 0:
         assert abs(box.yaw - true.yaw) < 2.5
         assert -0.001 < box.w - true.w < 0.007 and -0.001 < box.d - true.d < 0.007
+
+
+@pytest.mark.parametrize("tilt", [0, 20, 45])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_side_of_an_item_is_not_taken_for_its_top(seed, tilt):
+    """Cameras with pixels of about 1 mm that see an item from the side."""
+    draw, room, turn = np.random.default_rng(seed), (0.6, 0.4, 0.1), np.radians(tilt)
+    pose = np.eye(4)
+    pose[:3, :3] = np.diag((1.0, -1.0, -1.0)) @ [
+        [np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]
+    ]  # fmt: skip
+    pose[:3, 3] = np.array((0.3, 0.2, 0.05)) - 0.9 * pose[:3, 2]
+    eye = Camera(900, 900, 450, 350, pose, (700, 900))
+    size, centre = draw.uniform((0.06, 0.06, 0.03), (0.13, 0.12, 0.09)), draw.uniform((0.1, 0.1), (0.5, 0.3))
+    yaw = draw.uniform(-30, 30)
+    cell, shown = CellSpec(bin_size=(12, 8, 2)), image(eye, [box_of(size, *centre, yaw)], room, 0.0005, seed)
+    (box,) = eye.items(shown, cell, SIZE)
+    slack = eye.pixel() + box.edge_error
+    assert abs(box.h - size[2]) < 0.003 and box.edge_error < 0.004
+    for measured, true in ((box.w, size[0]), (box.d, size[1])):
+        assert -0.002 < measured - true < 2 * slack, (box, size)
+    assert np.hypot(box.x - centre[0], box.y - centre[1]) < slack, (box, centre)
 
 
 def test_a_tote_is_measured_and_hidden_places_count_as_high_as_what_hides_them():
@@ -112,6 +135,8 @@ def test_steps_or_labels_tell_items_apart():
         eye.items(shown, CELL, SIZE, sizes=[(0.1, 0.08, 0.06)])
     with pytest.raises(DepthMapError, match=r"is one item of 0.2 x 0.08 m or two of 0.1 x 0.08 and 0.1 x 0.08 m"):
         eye.items(shown, CELL, SIZE, sizes=[(0.1, 0.08, 0.06), (0.08, 0.2, 0.06)])
+    with pytest.raises(DepthMapError, match=r"is two of 0.13 x 0.08 and 0.07 x 0.077 m that touch"):
+        eye.items(shown, CELL, SIZE, sizes=[(0.13, 0.08, 0.06), (0.07, 0.077, 0.06)])
     with pytest.raises(DepthMapError, match="is no item of the given sizes"):
         eye.items(shown, CELL, SIZE, sizes=[(0.1, 0.1, 0.06)])
     left = eye.points(shown)[..., 0] < 0.12
