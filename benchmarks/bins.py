@@ -31,7 +31,9 @@ class Task(NamedTuple):
 
 
 TASKS = {
-    "gopt_rs": Task("gopt_rs, no gripper", ("checkpoint=pretrained/gopt_buffer",), "[20,20,1]", (1, 3, 5, 10), (1, 4, 9)),
+    "gopt_rs": Task(
+        "gopt_rs, no gripper", ("checkpoint=pretrained/gopt_buffer",), "[20,20,1]", (1, 3, 5, 10), (1, 4, 9)
+    ),
     "plate_5x5": Task("gopt_rs, plate of 5x5", ("checkpoint=pretrained/plate_5x5",), "[20,20,1]", (1, 3, 5, 10)),
     "mixed": Task(
         "27 kinds, 8x8x8, gripper", ("checkpoint=pretrained/mixed", "env.tote_size=[8,8,8]"), "[8,8,1]", (1, 2, 3, 5),

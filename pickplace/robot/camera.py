@@ -6,7 +6,6 @@ median of 3x3 pixels. Obstacles are widened by a pixel; surfaces that may suppor
 space counts as occupied, by the worst that may be there.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -198,7 +197,13 @@ class Camera:
         distances, origin = self._distances(depth), self.pose[:3, 3]
         seen = read_heights(self.rays(), origin, distances, room, self.pixel(), accuracy, placed)
         within = seen.is_within(room, self._wall())
-        middle = float(np.median(seen.height[within])) if within.any() else math.nan
+        refuse_if(
+            not within.any(),
+            f"depth: no pixel shows the inside of the {room.name}, expected most of them to: check the camera's pose, "
+            "which is relative to the floor, and the unit of the image.",
+            DepthMapError,
+        )
+        middle = float(np.median(seen.height[within]))
         refuse_if(
             not -0.05 < middle < room.rim + 0.5,
             f"depth: the {room.name} is seen at a height of {middle:.3f} m, expected 0 to {room.rim:g} m: check the "

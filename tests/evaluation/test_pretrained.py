@@ -17,10 +17,10 @@ from pickplace.runs.locate import PRETRAINED
 CARDS = sorted(PRETRAINED.glob(f"*/{export.CARD}"))
 EPISODES = 8
 POLICY_ALONE = (
-    "paper", "mixed", "warehouse", "gopt_rs", "cdrl_rs", "cut1", "cut2", "plate_3x3", "plate_5x5",
+    "paper", "mixed", "warehouse", "gopt_rs", "gopt_buffer", "cdrl_rs", "cut1", "cut2", "plate_3x3", "plate_5x5",
 )  # fmt: skip
 #: The networks of r4, gopt_rs, cut1 and mixed with other weights, or on a finer grid.
-LIKE_OTHERS = ("r1", "r3", "cdrl_rs", "cut2", "warehouse", "plate_3x3")
+LIKE_OTHERS = ("r1", "r3", "gopt_buffer", "cdrl_rs", "cut2", "warehouse", "plate_3x3")
 each_card = pytest.mark.parametrize("path", CARDS, ids=lambda path: path.parent.name)
 
 

@@ -206,6 +206,9 @@ def test_what_is_no_image_of_the_tote_is_refused():
     dark[:, :150] = 0
     with pytest.raises(DepthMapError, match="too few|are not seen"):
         eye.tote_map(dark, CELL, SIZE)
+    dark[50:190, 80:240] = 0
+    with pytest.raises(DepthMapError, match="no pixel shows the inside of the tote, expected most of them to"):
+        eye.tote_map(dark, CELL, SIZE)
     with pytest.raises(ValueError, match="camera.pose: the camera does not look down"):
         Camera(500, 500, 160, 120, np.eye(4), SHAPE)
     with pytest.raises(ValueError, match="camera.pose: expected .4, 4."):

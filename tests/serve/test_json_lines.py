@@ -34,7 +34,7 @@ def command(run):
     ("arguments", "message"),
     [
         (["nowhere"], "nowhere"),
-        (["pretrained/none"], "expected pretrained/cdrl_rs, pretrained/cut1, pretrained/cut2, pretrained/gopt_rs"),
+        (["pretrained/none"], "expected pretrained/cdrl_rs, pretrained/cut1, pretrained/cut2, pretrained/gopt_buffer"),
         (["pretrained/r4", "--bin", "bin.npy"], "--tote: no file"),
         (["pretrained/r4", "--bin", "bin.npy", "--tote", "missing.npy"], "missing.npy: No such file"),
         (["pretrained/r4", "--bin", "bin.npy", "--tote", "pickle.npy"], "pickle.npy: cannot be read; expected a .npy"),
