@@ -452,6 +452,9 @@ def test_items_of_a_fine_map_and_of_a_line():
     assert reply["status"] == "ok" and reply["box"] == boxes[reply["item_number"]]
     _, bad, _ = answer(planner, json.dumps({"items": [*boxes, {"x": 1}], **tote}).encode(), {})
     assert bad == {"error": "items[3]: expected the keys x, y, w, d, h and any of yaw, mass, max_load."}
+    for other in (boxes[0], "abc"):  # a single object is no list
+        _, bad, _ = answer(planner, json.dumps({"items": other, **tote}).encode(), {})
+        assert "items=" in bad["error"] and bad["error"].endswith(": expected a list of boxes."), bad
 
 
 def test_no_alternatives_where_no_item_is_gripped():
