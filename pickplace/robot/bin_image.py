@@ -49,7 +49,7 @@ def find_boxes(
         DepthMapError,
     )
     surface = seen.surface(room)
-    reach = 1 if labels is not None else _step_reach(seen, room, accuracy, greatest)
+    reach = _step_reach(seen, room, above, accuracy) if labels is None else 0
     segments = _segments(seen, above, accuracy, reach, labels)
     numbers, counts = np.unique(segments[segments > 0], return_counts=True)
     boxes, floor, free = [], seen.points_at_height(0.0), np.ones_like(seen.holes)
@@ -84,15 +84,19 @@ def _step(seen: Heights, accuracy: float) -> float:
     return 4 * accuracy + seen.pixel
 
 
-def _step_reach(seen: Heights, room: Room, accuracy: float, greatest: float) -> int:
+def _step_reach(seen: Heights, room: Room, above: np.ndarray, accuracy: float) -> int:
     """Return the number of pixels on each side within which a step of the height is looked for.
 
     A camera that looks at an item from the side also sees its side, whose pixels are lower the further out they are.
     The reach is so long that any side has the whole step within it, with a quarter more for noise.
     """
-    way = seen.origin[2] - greatest  # down to the highest item, where the pixels are smallest
-    slant = float(np.linalg.norm(room.corners - seen.origin[:2], axis=1).max()) / way
-    pixel = seen.pixel * way / seen.origin[2]
+    heights, camera = seen.height[above], seen.origin[2]
+    if len(heights) < MIN_ITEM_PIXELS:
+        return 1
+    highest = np.partition(heights, -MIN_ITEM_PIXELS)[-MIN_ITEM_PIXELS]
+    way = camera - min(highest, camera / 2)  # down to the highest item, where the pixels are smallest
+    slant = np.linalg.norm(room.corners - seen.origin[:2], axis=1).max() / way
+    pixel = seen.pixel * way / camera
     return max(1, math.ceil(1.25 * _step(seen, accuracy) * slant / (2 * pixel)))
 
 

@@ -88,6 +88,13 @@ def test_the_side_of_an_item_is_not_taken_for_its_top(seed, tilt):
     assert np.hypot(box.x - centre[0], box.y - centre[1]) < slack, (box, centre)
 
 
+@pytest.mark.parametrize("greatest", [0.25, 1.2, 2.0])
+def test_items_may_be_allowed_to_be_as_high_as_the_camera(greatest):
+    shown = image(camera(BIN), [box_of((0.1, 0.08, 0.06), 0.12, 0.12)], BIN, 0.001)
+    (box,) = camera(BIN).items(shown, CELL, SIZE, greatest_height=greatest)
+    assert (box.w, box.d, box.h) == pytest.approx((0.1, 0.08, 0.06), abs=0.005)
+
+
 def test_a_tote_is_measured_and_hidden_places_count_as_high_as_what_hides_them():
     boxes = [box_of((0.12, 0.08, 0.2), 0.08, 0.06), box_of((0.1, 0.1, 0.06), 0.2, 0.2, 20.0)]
     eye = camera()
