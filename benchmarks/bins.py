@@ -96,14 +96,14 @@ def read() -> dict[Cell, dict]:
 
 
 def draw() -> None:
-    """Draw the occupancy over the number of items to choose from, with intervals; an area for each task."""
+    """Draw the occupancy over the number of items to choose from, with intervals; an area for each measured task."""
     rows = read()
-    names = [name for name in TASKS if any(cell.task == name for cell in rows)]
+    names = [name for name in TASKS if rows.keys() >= {*cells([name])}]  # a task that is being played waits
     figure = figure_of(10, 4)
     areas = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
     for axes, name in zip(areas, names, strict=True):
         for colour, (method, (label, _)) in zip(COLOURS, METHODS.items(), strict=False):
-            counts = [count for count in TASKS[name].counts if Cell(name, count, 0, method) in rows]
+            counts = TASKS[name].counts
             line = [rows[Cell(name, count, 0, method)] for count in counts]
             errors = [[row["mean"] - row["low"] for row in line], [row["high"] - row["mean"] for row in line]]
             style = "-" if method in ("beam", "values") else "--"

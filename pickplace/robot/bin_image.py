@@ -134,7 +134,7 @@ def _read_box(
     height = float(np.quantile(seen.height[top], 0.95))
     if narrowed:
         level = above & (segments == 0) & (np.abs(seen.height - height) <= band)
-        # As far again, for the corners of a turned item, into which the square of the search does not fit.
+        # As far again: the square of the search does not fit into the corners of a turned item.
         top = ndimage.binary_dilation(top, EIGHT_NEIGHBOURS, iterations=2 * narrowed - 1, mask=level | top)
     points, pixel = seen.points_at_height(height), seen.pixel * (seen.origin[2] - height) / seen.origin[2]
     # A pixel that is lower than the error of a height allows shows the item's side, so its own place is nearer.
