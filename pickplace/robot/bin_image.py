@@ -137,13 +137,17 @@ def _read_box(
         # As far again: the square of the search does not fit into the corners of a turned item.
         top = ndimage.binary_dilation(top, EIGHT_NEIGHBOURS, iterations=2 * narrowed - 1, mask=level | top)
     points, pixel = seen.points_at_height(height), seen.pixel * (seen.origin[2] - height) / seen.origin[2]
-    # A pixel that is lower than the error of a height allows shows the item's side, so its own place is nearer.
+    # A pixel more than ``accuracy`` below the top shows the item's side: where it lies is nearer to the edge than where
+    # its ray passes the height of the top.
     places = seen.points_at_height(np.fmin(height, seen.height + accuracy))
     x, y, w, d, yaw = smallest_rectangle(places[top])
     _check_top(seen, (x, y, w, d, yaw), points, top, pixel, accuracy)
     # Each side may be as far out as the first ray in front of it that passes the height of the top.
     known = ~np.isnan(seen.height)
     passed = known & ~top & (np.abs(seen.height - height) > band)
+    # One that ends at a wall before it would have come there, inside the room, tells nothing.
+    at_wall = known & (seen.height > height) & (distance_outside(seen.points, room) > -margin)
+    passed &= ~(at_wall & (distance_outside(points, room) < 0))
     if not narrowed:  # labels separate it from others of the same height
         passed |= (segments > 0) & ~top
     # Nor can the box stand on a place that is seen.
@@ -162,7 +166,8 @@ def _read_box(
         return {"x": float(x + shift[0]), "y": float(y + shift[1]), "w": float(w + by[0] + by[1]),
                 "d": float(d + by[2] + by[3]), "h": height, "yaw": yaw}  # fmt: skip
 
-    slant = float(np.hypot(*(seen.origin[:2] - (x, y)))) / (seen.origin[2] - height)  # the item's side seems top so far
+    # The uppermost part of a side, as high as ``accuracy``, looks like the top.
+    slant = float(np.hypot(*(seen.origin[:2] - (x, y)))) / (seen.origin[2] - height)
     error = float(max(0.0, outer.max() - pixel, accuracy * slant - pixel / 2))
     on_top = is_inside(points, (x, y), (w, d), yaw)
     if (outer <= longest).all() and not seen.holes_above(height, surface, room, accuracy, on_top).any():

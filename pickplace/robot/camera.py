@@ -105,7 +105,7 @@ class Camera:
         )
 
     def pixel(self, height: float = 0.0) -> float:
-        """Return the length that a pixel shows of a level surface at a height, in the middle of the image, m."""
+        """Return the length that a pixel shows of a level surface at a height, where the optical axis meets it, m."""
         return float((self.pose[2, 3] - height) / min(self.fx, self.fy) / self.pose[2, 2] ** 2)
 
     def tote_map(

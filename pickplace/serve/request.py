@@ -165,7 +165,7 @@ def read_boxes(key: str, items) -> list[Box]:
     """Return the boxes of a request's ``items``, ``placed`` or ``coming``.
 
     Raises:
-        ValueError: for no list, or naming the first box with other keys.
+        ValueError: if it is no list; or naming the first box with other keys.
     """
     boxes = []
     for at, item in enumerate(expect(isinstance(items, list), key, items, "a list of boxes")):

@@ -66,17 +66,21 @@ def test_an_item_is_measured(seed):
         assert -0.001 < box.w - true.w < 0.007 and -0.001 < box.d - true.d < 0.007
 
 
+def tilted_camera(tilt: float, away: float, focal: float) -> Camera:
+    """A camera towards -x of a bin of 0.6 x 0.4 m, that looks at its middle."""
+    turn, pose = np.radians(tilt), np.eye(4)
+    pose[:3, :3] = np.diag((1.0, -1.0, -1.0)) @ [
+        [np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]
+    ]  # fmt: skip
+    pose[:3, 3] = np.array((0.3, 0.2, 0.05)) - away * pose[:3, 2]
+    return Camera(focal, focal, 450, 350, pose, (700, 900))
+
+
 @pytest.mark.parametrize("tilt", [0, 20, 45])
 @pytest.mark.parametrize("seed", range(2))
 def test_the_side_of_an_item_is_not_taken_for_its_top(seed, tilt):
     """Cameras with pixels of about 1 mm that see an item from the side."""
-    draw, room, turn = np.random.default_rng(seed), (0.6, 0.4, 0.1), np.radians(tilt)
-    pose = np.eye(4)
-    pose[:3, :3] = np.diag((1.0, -1.0, -1.0)) @ [
-        [np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]
-    ]  # fmt: skip
-    pose[:3, 3] = np.array((0.3, 0.2, 0.05)) - 0.9 * pose[:3, 2]
-    eye = Camera(900, 900, 450, 350, pose, (700, 900))
+    draw, room, eye = np.random.default_rng(seed), (0.6, 0.4, 0.1), tilted_camera(tilt, 0.9, 900)
     size, centre = draw.uniform((0.06, 0.06, 0.03), (0.13, 0.12, 0.09)), draw.uniform((0.46, 0.1), (0.52, 0.3))
     yaw = draw.uniform(-30, 30)
     cell, shown = CellSpec(bin_size=(12, 8, 2)), image(eye, [box_of(size, *centre, yaw)], room, 0.0005, seed)
@@ -86,6 +90,19 @@ def test_the_side_of_an_item_is_not_taken_for_its_top(seed, tilt):
     for measured, true in ((box.w, size[0]), (box.d, size[1])):
         assert -0.002 < measured - true < 2 * slack, (box, size)
     assert np.hypot(box.x - centre[0], box.y - centre[1]) < slack, (box, centre)
+
+
+@pytest.mark.parametrize(("tilt", "height", "gap"), [(40, 0.015, 0.005), (40, 0.015, 0.02), (30, 0.04, 0.005)])
+def test_an_item_that_a_wall_hides_in_part_is_not_measured(tilt, height, gap):
+    """The camera stands outside the bin, whose near wall hides a side of the item."""
+    cell, room = CellSpec(bin_size=(12, 8, 2)), (0.6, 0.4, 0.1)
+    eye = tilted_camera(tilt, 1.1, 700)
+    hidden = image(eye, [box_of((0.09, 0.06, height), gap + 0.045, 0.2)], room, 0.0008)
+    with pytest.raises(DepthMapError, match="not seen well enough"):
+        eye.items(hidden, cell, SIZE)
+    far = image(eye, [box_of((0.09, 0.06, height), 0.6 - gap - 0.045, 0.2)], room, 0.0008)
+    (box,) = eye.items(far, cell, SIZE)
+    assert type(box) is Box and 0 < box.w - 0.09 < 2 * (eye.pixel() + box.edge_error)
 
 
 @pytest.mark.parametrize("greatest", [0.25, 1.2, 2.0])
