@@ -1,9 +1,9 @@
 """Measure what a choice among several items gains: python benchmarks/bins.py
 
 Plays the test stream with 1 to 10 items to choose from, and with one item and previews of the next ones.
-docs/results/bins.csv keeps what was measured, and bins.png beside it draws this. What is there is not played again:
-delete the rows to repeat.
-``python benchmarks/bins.py mixed`` plays only this task, so that several processes can share the work.
+docs/results/bins.csv keeps what was measured, and bins.png beside it draws this. What is there is not played again; to
+repeat a row, delete it. ``python benchmarks/bins.py mixed`` plays only this task, so that several processes can share
+the work.
 """
 
 import sys

@@ -54,9 +54,7 @@ def find_boxes(
     numbers, counts = np.unique(segments[segments > 0], return_counts=True)
     boxes, floor, free = [], seen.points_at_height(0.0), np.ones_like(seen.holes)
     for number in numbers[counts >= MIN_ITEM_PIXELS]:
-        box, seen_top = _read_box(
-            seen, room, margin, surface, segments, number, above, accuracy, reach if labels is None else 0
-        )
+        box, seen_top = _read_box(seen, room, margin, surface, segments, number, above, accuracy, reach)
         boxes.append(box)
         if not isinstance(box, UnknownBox):
             free &= ~is_inside(floor, *seen_top)
@@ -119,7 +117,7 @@ def _segments(seen: Heights, above: np.ndarray, accuracy: float, reach: int, lab
 
 def _read_box(
     seen: Heights, room: Room, margin: float, surface: np.ndarray, segments: np.ndarray, number: int,
-    above: np.ndarray, accuracy: float, narrowed: int,
+    above: np.ndarray, accuracy: float, reach: int,
 ) -> tuple[Box, tuple]:  # fmt: skip
     """Return the cuboid whose top fills a segment, and the seen part of its top: centre, sides and yaw.
 
@@ -128,14 +126,14 @@ def _read_box(
     Args:
         margin: width of the border along the walls in which no top is seen, m.
         surface: see :meth:`Heights.surface`.
-        narrowed: number of the segment's outermost pixels that the search for steps removed; 0 if labels made it.
+        reach: number of the segment's outermost pixels that the search for steps removed; 0 if labels made it.
     """
     top, band = segments == number, level_range(accuracy)
     height = float(np.quantile(seen.height[top], 0.95))
-    if narrowed:
+    if reach:
         level = above & (segments == 0) & (np.abs(seen.height - height) <= band)
-        # As far again: the square of the search does not fit into the corners of a turned item.
-        top = ndimage.binary_dilation(top, EIGHT_NEIGHBOURS, iterations=2 * narrowed - 1, mask=level | top)
+        # Twice as far, as the square of the search removes more at the corners of a turned item.
+        top = ndimage.binary_dilation(top, EIGHT_NEIGHBOURS, iterations=2 * reach - 1, mask=level | top)
     points, pixel = seen.points_at_height(height), seen.pixel * (seen.origin[2] - height) / seen.origin[2]
     # A pixel more than ``accuracy`` below the top shows the item's side: where it lies is nearer to the edge than where
     # its ray passes the height of the top.
@@ -148,7 +146,7 @@ def _read_box(
     # One that ends at a wall before it would have come there, inside the room, tells nothing.
     at_wall = known & (seen.height > height) & (distance_outside(seen.points, room) > -margin)
     passed &= ~(at_wall & (distance_outside(points, room) < 0))
-    if not narrowed:  # labels separate it from others of the same height
+    if not reach:  # labels separate it from others of the same height
         passed |= (segments > 0) & ~top
     # Nor can the box stand on a place that is seen.
     axes = turned_axes(math.radians(yaw))

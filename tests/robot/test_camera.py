@@ -77,6 +77,13 @@ def tilted_camera(tilt: float, away: float, focal: float) -> Camera:
 
 
 @pytest.mark.parametrize("tilt", [0, 20, 45])
+def test_a_tilted_camera_shows_more_with_a_pixel(tilt):
+    eye = tilted_camera(tilt, 0.9, 900)
+    height, angles = eye.pose[2, 3], np.radians(tilt) + np.arctan(np.array([-0.5, 0.5]) / 900)
+    assert eye.pixel() == pytest.approx(height * np.ptp(np.tan(angles)), rel=1e-3)
+
+
+@pytest.mark.parametrize("tilt", [0, 20, 45])
 @pytest.mark.parametrize("seed", range(2))
 def test_the_side_of_an_item_is_not_taken_for_its_top(seed, tilt):
     """Cameras with pixels of about 1 mm that see an item from the side."""
