@@ -337,7 +337,7 @@ def test_clients_that_stop_are_cut_off(text, impatient):
                     one.sendall(b"x")
             return not client.server.server_state.connections
 
-        wait_for(are_cut_off, seconds=5)
+        wait_for(are_cut_off)
         assert client.ask("GET", "/health")[0] == 200
         assert all(map(is_ended, sockets))
 
