@@ -40,7 +40,12 @@ TASKS = {
         "27 kinds, 8x8x8, gripper", ("checkpoint=pretrained/mixed", "env.tote_size=[8,8,8]"), "[8,8,1]", (1, 2, 3, 5),
         episodes=200,
     ),
+    "plate_3x3": Task("gopt_rs, plate of 3x3", ("checkpoint=pretrained/plate_3x3",), "[20,20,1]", (1, 10)),
+    "cdrl_rs": Task("cdrl_rs", ("checkpoint=pretrained/cdrl_rs",), "[20,20,1]", (1, 10)),
+    "cut1": Task("cut1", ("checkpoint=pretrained/cut1",), "[20,20,1]", (1, 10)),
+    "cut2": Task("cut2", ("checkpoint=pretrained/cut2",), "[20,20,1]", (1, 10)),
 }  # fmt: skip
+DRAWN = ("gopt_rs", "plate_5x5", "mixed")
 #: Method -> its label, and words for pickplace-evaluate.
 METHODS = {
     "beam": ("values, beam search", ("planner=beam", "physics=settle")),
@@ -97,9 +102,9 @@ def read() -> dict[Cell, dict]:
 
 
 def draw() -> None:
-    """Draw the occupancy over the number of items to choose from, with intervals; an area for each measured task."""
+    """Draw the occupancy over the number of items to choose from, with intervals; an area for each task."""
     rows = read()
-    names = [name for name in TASKS if rows.keys() >= {*cells([name])}]  # a task that is being played waits
+    names = [name for name in DRAWN if rows.keys() >= {*cells([name])}]  # a task that is being played waits
     figure = figure_of(10, 4)
     areas = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
     for axes, name in zip(areas, names, strict=True):

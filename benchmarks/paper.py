@@ -251,7 +251,8 @@ def draw_bars(axes, rows: list[dict], methods: tuple[str, ...], totes: tuple[str
         errors = [[row["mean"] - row["low"] for _, row in line], [row["high"] - row["mean"] for _, row in line]]
         style = {"color": STYLE[method], "ecolor": "#37474f", "error_kw": {"elinewidth": 1}, "capsize": 2}
         drawn = axes.bar(xs, means, width * 0.92, yerr=errors, label=LABELS[method], **style)
-        axes.bar_label(drawn, fmt="%.2f", fontsize=7, padding=2)
+        texts = [f"{int(mean * 100) / 100:.2f}" for mean in means]  # never rounded up to a full tote
+        axes.bar_label(drawn, texts, fontsize=7, padding=2)
     axes.set_xticks(range(len(totes)), totes)
     axes.set(xlim=(-0.5, len(totes) - 0.5), ylim=(0, 1.1), xlabel="tote")
 
