@@ -121,14 +121,21 @@ def metric_map(name: str, values, grid: Sequence[int], least: float, most: float
     return array
 
 
-def bounds_of_points(array: np.ndarray, grid: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the greatest and the least value of each patch of a map that was measured at points; see :func:`patches`.
+def bounds(array: np.ndarray, grid: Sequence[int], samples: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the greatest and the least value of each patch of a map of heights; see :func:`patches`.
 
-    Each value was measured in the middle of its square. An edge may pass between two middles, so a square may have its
-    own value or the value of any of its eight neighbours. A thing narrower than two squares may be missed.
+    Args:
+        samples: "area": a value is the greatest in its square, and a thing that ends in the square may cover little of
+            it. Then a neighbour that it does not reach is lower. So only what all eight neighbours have, too, surely
+            covers the square. With one value a cell the neighbours do not count: ``tote_bearing`` says what carries.
+            "centre": a value was measured in the middle of its square. An edge may pass between two middles, so a
+            square may have its own value or the value of any of its eight neighbours. A thing narrower than two squares
+            may be missed.
     """
-    near = sliding_window_view(np.pad(array, 1, mode="edge"), (3, 3))
-    return patches(near.max((2, 3)), grid)[0], patches(near.min((2, 3)), grid)[1]
+    is_area, near = samples == "area", sliding_window_view(np.pad(array, 1, mode="edge"), (3, 3))
+    if is_area and array.shape[0] == grid[0]:
+        return patches(array, grid)
+    return patches(array if is_area else near.max((2, 3)), grid)[0], patches(near.min((2, 3)), grid)[1]
 
 
 def patches(array: np.ndarray, grid: Sequence[int], most: int = MAX_PATCHES) -> tuple[np.ndarray, np.ndarray]:

@@ -18,12 +18,11 @@ from pickplace.robot.measure import (
     ROUNDING,
     ToteMap,
     as_array,
-    bounds_of_points,
+    bounds,
     box_of_map,
     least_height,
     metric_map,
     overlap_mask,
-    patches,
     refuse_stacked,
     segments_of_map,
     turned_axes,
@@ -298,7 +297,7 @@ def _read_tote(cell: CellSpec, scene: Scene, unit: float, error: float, device) 
     else:
         beyond = max(4 * scene.accuracy, 0.01)  # a floor or a rim that noise puts a little out of range
         depth = metric_map("tote_depth", scene.tote, grid, -beyond, height + beyond)
-        highest, lowest = (patches if scene.tote_samples == "area" else bounds_of_points)(height - depth, grid)
+        highest, lowest = bounds(height - depth, grid, scene.tote_samples)
     high, low = (whole_units(part.clip(0, None), MILLIMETRE, up) for part, up in ((highest, True), (lowest, False)))
     count = len(high) // grid[0]
     on_floor = (high <= floor_height(slack)).unflatten(0, (-1, count)).unflatten(2, (-1, count)).all(3).all(1)
