@@ -34,7 +34,8 @@ def slabs(end: float) -> np.ndarray:
 
 @pytest.mark.parametrize("name", ["joint_dbl", "pretrained/warehouse"])
 @pytest.mark.parametrize(("end", "error", "status"), [
-    (0.051, None, "stuck"), (0.051, 0.0, "ok"), (0.066, None, "ok"), (0.0625, 0.003, "ok"), (0.055, 0.005, "stuck"),
+    (0.051, None, "stuck"), (0.051, 0.0, "stuck"), (0.055, 0.0, "ok"), (0.066, None, "ok"), (0.0625, 0.003, "ok"),
+    (0.055, 0.005, "stuck"),
 ])  # fmt: skip
 def test_a_sliver_of_contact_carries_nothing(name, end, error, status):
     """The item of 120 mm lies at x 50 to 170 mm, on the ends of two slabs."""
@@ -44,6 +45,38 @@ def test_a_sliver_of_contact_carries_nothing(name, end, error, status):
     seen = {"tote_depth": slabs(end), "tote_height": 0.22, "cell_size": 0.02, "placement_error": error}
     plan = plan_for(planner, items=[Box(0.15, 0.15, 0.12, 0.12, 0.06)], **seen, alternatives=0)
     assert plan.status == status
+
+
+@pytest.mark.parametrize("wrong_by", [0.0, 0.005])
+def test_no_item_lies_on_an_end_that_sticks_out_of_a_square(wrong_by):
+    """B sticks out over A by half the side of an item: its centre stays above A, though a square shows only A's end."""
+    planner, tote = Planner(CellSpec(tote_size=(3, 3, 10)), planner="joint_dbl"), np.zeros((15, 15))
+    seen, sides = {"placed": []}, [(0.091, 0.05), (0.112, 0.01), (0.04, 0.4)]
+    for w, h in sides:
+        plan = plan_for(planner, items=[Box(0.125, 0.125, w, 0.14, h)], tote_depth=0.5 - tote, cell_size=CELL, **seen)
+        box = plan.placed
+        covered = [range(int((middle - side / 2) // 0.01), -int(-(middle + side / 2) // 0.01))
+                   for middle, side in ((box.x, box.w), (box.y, box.d))]  # fmt: skip
+        tote[np.ix_(*covered)] = box.h
+        seen = {"placed": [*seen["placed"], box], "tote_bearing": plan.tote_bearing}
+    under, _, last = seen["placed"]
+    assert last.h > 0.4 and abs(last.x - under.x) + wrong_by < under.w / 2
+
+
+@pytest.mark.parametrize("support", ["full", "bearing"])
+@pytest.mark.parametrize(("squares", "item", "rail", "rails"), [
+    (5, 0.04, 0.0102, (0.025, 0.075, 0.125, 0.175, 0.225, 0.275)), (2, 0.096, 0.002, (0.1, 0.2)),
+])  # fmt: skip
+def test_a_narrow_rail_carries_nothing(support, squares, item, rail, rails):
+    """It is narrower than two squares, and reaches into a square on both sides of the item's middle."""
+    planner = Planner(CellSpec(tote_size=(6, 6, 5), support=support), planner="joint_dbl")
+    depth, begin = np.full((6 * squares,) * 2, 0.2), np.arange(6 * squares) * CELL / squares
+    for middle in rails:
+        depth[(begin < middle + rail / 2) & (begin + CELL / squares > middle - rail / 2)] = 0.15
+    seen = {"tote_height": 0.25, "cell_size": CELL, "clearance": 0.002, "placement_error": 0.0, "alternatives": 0}
+    for tote_depth, status in ((np.full_like(depth, 0.2), "ok"), (depth, "stuck")):
+        plan = plan_for(planner, items=[Box(0.125, 0.125, item, 0.1, 0.04)], tote_depth=tote_depth, **seen)
+        assert plan.status == status
 
 
 WIDE = CellSpec(bin_size=(25, 20, 10), tote_size=(20, 15, 44), height_unit=0.25, **SEAL)

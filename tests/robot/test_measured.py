@@ -170,12 +170,15 @@ def test_a_low_box_is_no_floor_and_a_patch_that_is_covered_in_part_is_not_whole(
 
 @pytest.mark.parametrize("along", [5, 10])
 def test_the_share_of_an_item_that_is_carried_decides(along):
-    """The item spans two boxes, so that its centre is over their hull: of its 8 cm they carry 2, or 6."""
+    """The item spans two boxes, so that its centre is over their hull: of its 8 cm they carry 2, or 6.
+
+    Of the 6, a square at the inner edge of each box may be covered in part.
+    """
     statuses = []
     for carried in (0.01, 0.03):
         scene = World((0.25, 0.25, 0.05), (0.1, 0.1, 0.25), (0.1, 0.1), (0.08, 0.08, 0.06), (0.125, 0.125), 0.0)
         scene.boxes += [(0, 0, 0.01 + carried, 0.1, 0.1), (0.09 - carried, 0, 0.1, 0.1, 0.1)]
-        planner = Planner(CellSpec(tote_size=(2, 2, 5), effector_size=(2, 2), support="half"), planner="joint_dbl")
+        planner = Planner(CellSpec(tote_size=(2, 2, 5), effector_size=(2, 2), support=0.3), planner="joint_dbl")
         seen = {"tote_depth": scene.tote_map(20 * along, 0), "cell_size": CELL}
         statuses.append(plan_for(planner, items=[Box(*scene.centre, *scene.item)], **seen).status)
     assert statuses == ["stuck", "ok"]
