@@ -31,8 +31,8 @@ _repr.maxstring = _repr.maxother = 80
 
 
 def excerpt(value) -> str:
-    """Return the representation of a value for a message, cut to some 100 characters."""
-    text = _repr.repr(value)
+    """Return the representation of a value for a message, on one line, cut to some 100 characters."""
+    text = " ".join(map(str.strip, _repr.repr(value).splitlines()))
     return text if len(text) <= 120 else f"{text[:80]}...{text[-30:]}"
 
 

@@ -26,7 +26,9 @@ def own_values(cfg: DictConfig) -> DictConfig:
     """
     running = HydraConfig.get()
     search = search_words(running.overrides.hydra)
-    given = [(override, *_package_and_places(override, search)) for override in parse(task_overrides())]
+    found = [(override, *_package_and_places(override, search)) for override in parse(task_overrides())]
+    last = {_choice_of(each): each for each, package, _ in found if package}  # as in Hydra, of the choices for a group
+    given = [one for one in found if not one[1] or last[_choice_of(one[0])] is one[0]]
     cfg = _of_benchmark(cfg, given, search)
     choices = [(each, places) for each, package, places in given if package and not each.is_delete()]
     pairs = [(place, choice) for choice, places in choices for place in places if place not in KEPT_GROUPS]
@@ -126,6 +128,11 @@ def _package_and_places(override: Override, search: list[str]) -> tuple[str | No
         return package, [own if package == own else f"{package}.{own}"]
     part = part_at(hydra.compose(None, [*search, line_of(override, "+")]), package)
     return package, [f"{package}.{key}" for key in part or ()]
+
+
+def _choice_of(override: Override) -> tuple[str, str | None]:
+    """Return what an option is chosen for: its group, and the package if one is given."""
+    return override.key_or_group, override.package
 
 
 def _is_in(place: str, outer: str) -> bool:

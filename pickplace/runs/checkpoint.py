@@ -97,6 +97,18 @@ def check_state(state, name: str) -> None:
             check_state(value, f"{name}|{key}")
 
 
+def check_loads(owner, name: str) -> None:
+    """Refuse an object whose class saves a state of its own, and loads only what its base class knows.
+
+    Raises:
+        ValueError: a resume would lose the state without a word.
+    """
+    classes = type(owner).__mro__
+    saves, loads = (next(each for each in classes if key in vars(each)) for key in ("state_dict", "load_state_dict"))
+    forgets = saves is not loads and issubclass(saves, loads)
+    refuse_if(forgets, f"{name}: {saves.__name__} has a state_dict without a load_state_dict; expected both.")
+
+
 def flatten(tree, prefix: str = "") -> tuple[dict[str, Tensor], dict]:
     """Split nested dicts and lists into tensors by path, and plain values by path."""
     tensors: dict[str, Tensor] = {}
@@ -249,7 +261,8 @@ def matching_state(saved, own: dict, what: str, path: str = "") -> dict:
         else:
             refuse_if(
                 (kind := _kind(value)) != (wanted := _kind(expected)),
-                f"The checkpoint's {what} does not fit these settings: {name} is {kind}, expected {wanted}.",
+                f"The checkpoint's {what} does not fit these settings: {name} is {kind}, expected "
+                f"{'None' if expected is None else wanted}.",
                 CheckpointError,
             )
             refuse_if(

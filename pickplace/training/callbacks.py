@@ -7,6 +7,7 @@ from pickplace.common.errors import sentence
 from pickplace.common.validate import expect, number, or_null, refuse_if, whole_number
 from pickplace.config.registry import build
 from pickplace.evaluation.play import Episodes
+from pickplace.runs.checkpoint import check_loads
 from pickplace.runs.loggers import check_metrics
 
 
@@ -106,6 +107,7 @@ def make_callbacks(cfg, states, validated_alike: bool = True) -> dict[str, Callb
             callback,
             "the settings of a callback, with its _target_",
         )
+        check_loads(callback, f"callbacks.{name}")
         try:
             if name in states and (validated_alike or not callback.compares_validations):
                 callback.load_state_dict(states[name])

@@ -156,6 +156,7 @@ class Trainer:
         expect(isinstance(algorithm, Algorithm), "algo", algorithm, "an algorithm, such as algo=ppo")
         self.algorithm = with_warm_start(algorithm, self.warm_start)
         checkpoint.check_state(self.algorithm.state_dict(), "algo: its state")  # now, not when it is resumed
+        checkpoint.check_loads(self.algorithm, "algo")
         settings.check_memory(cfg, self.env, self.policy, self.algorithm)
 
     def _restored(self, key: str, make, weights: dict) -> Any:

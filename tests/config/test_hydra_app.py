@@ -187,6 +187,12 @@ OWN_VALUES = [
     ("experiment=mine items=tall", {"items.kinds": None}),
     ("experiment=mine algo=a2c", {"algo.lr": 0.5}),
     ("experiment=mine callbacks=early_stopping", {"callbacks.early_stopping.patience": 3}),
+    # of two choices for a group, the last one
+    ("curriculum=mixture curriculum=none", {"curriculum.advance": {"_target_": "none"}}),
+    ("algo=a2c algo=td model=afterstate", {"algo._target_": "td", "algo.entropy_coeff": None}),
+    ("items=mixed items=boxes", {"items._target_": "uniform"}),
+    ("gripper=plate_5x5 gripper=point", {"env.gripper.size": [1, 1]}),
+    ("support=half support=hull", {"env.support._target_": "hull"}),
     # groups that set a part of env
     ("experiment=smoke", {"env.reach": None}),
     ("experiment=far", {"env.reach.radii": [0, 50]}),

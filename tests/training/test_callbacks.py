@@ -60,6 +60,14 @@ class Broken(Callback):
     def state_dict(self):
         return {"state": {1, 2}} if self.state else {}
 
+    def load_state_dict(self, state):
+        pass
+
+
+class Forgetful(Callback):
+    def state_dict(self):
+        return {"batches": 1}
+
 
 @pytest.fixture(autouse=True)
 def forget():
@@ -229,6 +237,7 @@ def test_early_stopping_by_the_command(run, no_report):
         ),
         ({"_target_": "early_stopping", "patience": 1}, {"mine": [1]}, "callbacks.mine: its state cannot be"),
         ({"_target_": "test_callbacks.Broken", "state": True}, {}, "callbacks.mine: its state .* set is not JSON"),
+        ({"_target_": "test_callbacks.Forgetful"}, {}, "Forgetful has a state_dict without a load_state_dict"),
     ],
 )
 def test_bad_callbacks_are_one_sentence(node, states, expected):
@@ -259,6 +268,7 @@ def test_a_callback_that_breaks_a_training_is_named(smoke, tmp_path, settings, e
         ("learn", None, "its metrics=None: expected {name: number}"),
         ("state_dict", {"0": 1}, "its state: the key='0': expected a whole number, or a text that is no number"),
         ("state_dict", {"a": {"b|c": 1}}, r"its state\|a: the key='b\|c': expected"),
+        ("state_dict", {"seen": 1}, "PPO has a state_dict without a load_state_dict; expected both"),
         ("state_dict", {"seen": []}, r"its state\|seen=\[\]: expected nested dicts of tensors, numbers and texts"),
     ],
 )

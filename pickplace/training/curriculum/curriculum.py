@@ -169,7 +169,7 @@ class Curriculum:
             expect(isinstance(value, Real), f"{self._rule}: it logs {name}", value, "a number")
         self._rule_state()
         means = {number: occupancy[levels == number].mean().item() for number in levels.unique().tolist()}
-        logs |= {
+        own = {
             "level": level,
             "frames_at_level": tally.level_frames,
             "episodes": tally.episodes,
@@ -177,6 +177,9 @@ class Curriculum:
             **({"occupancy": tally.mean} if tally.window else {}),
             **{f"occupancy_at_{number}": mean for number, mean in means.items()},
         }
+        taken = ", ".join(sorted(logs.keys() & {*own, "occupancy"}))
+        refuse_if(taken, f"{self._rule}: it logs {taken}, which the curriculum logs itself; expected other names.")
+        logs |= own
         if level != tally.level:
             if not (tally.episodes or self.weights):
                 keys = "more frames for it (curriculum.advance), or a smaller env.num_envs"
