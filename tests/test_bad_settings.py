@@ -400,8 +400,8 @@ def test_scores_of_many_footprints_are_computed_in_parts(monkeypatch):
 
 
 def test_values_and_sentences_are_short():
-    for value in ("x" * 100_000, list(range(10**5)), {"a" * 10**5: "b" * 10**5}, 10**3000, object()):
-        assert len(excerpt(value)) < 200
+    for value in ("x" * 100_000, list(range(10**5)), {"a" * 10**5: "b" * 10**5}, 10**3000, object(), torch.ones(2, 2)):
+        assert len(excerpt(value)) < 200 and len(excerpt(value).splitlines()) == 1
     for error in (ValueError("x" * 100_000), RuntimeError("y" * 100_000), OSError(13, "z" * 10**5, "f" * 10**5)):
         assert len(errors.sentence(error)) <= errors.MAX_LENGTH
     with pytest.raises(ValueError) as caught:

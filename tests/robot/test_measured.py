@@ -117,7 +117,7 @@ def test_no_end_effector_makes_an_ok_plan_go_wrong(name, scenes, monkeypatch):
 @pytest.mark.parametrize("name", ["pretrained/r4", "pretrained/mixed", "joint_dbl"])
 def test_no_plan_that_is_ok_goes_wrong_in_20_000_scenes(name):
     found = count_faults(name, 20_000, 100)
-    assert set(found) <= {"ok", "stuck", "impossible"} and found["ok"] > 8_000, found
+    assert set(found) <= {"ok", "stuck", "impossible"} and found["ok"] > 7_000, found
 
 
 @pytest.mark.parametrize("name", ["pretrained/r4", "pretrained/mixed", "joint_dbl"])
