@@ -147,8 +147,6 @@ def unknown_key(key: str, node: DictConfig | dict, prefix: str = "", others: Col
             return f"{short_text(key)}: {place} is {value}, without keys; expected an option that gives it some."
         prefix, node = f"{prefix}{parent}.", child
     known = [str(name) for name in node if name not in ("_target_", "hydra")]
-    if leaf in known:  # after ~, of a key that is null
-        return f"{short_text(key)} cannot be removed; expected a value for it, such as null."
     close = get_close_matches(leaf, known, 1) if prefix or not others else full_names(key, others)
     expected = f"expected one of {', '.join(known)}." if known else "expected no key."
     hint = f"did you mean {' or '.join(map(repr, close))}?" if close else expected

@@ -177,6 +177,8 @@ def clearer_error(error: HydraException, config_name: str, words: list[str]) -> 
             search = search_words(words)
             choices = [line_of(each) for each in parse(words) if group_options(each.key_or_group, search)]
             known = hydra.compose(config_name, [*search, *_first_of_sweep(choices)], return_hydra_config=True)
+    if "delete" in key[0] and OmegaConf.select(known, key[1], default=key) is None:
+        return ValueError(f"{key[1]}: it is null already; expected no ~{key[1]}.")
     return ValueError(unknown_key(key[1], known, others=known_names(known)))
 
 

@@ -126,8 +126,9 @@ def bounds(array: np.ndarray, grid: Sequence[int], samples: str) -> tuple[np.nda
 
     Args:
         samples: "area": a value is the greatest in its square, and a thing that ends in the square may cover little of
-            it. Then a neighbour that it does not reach is lower. So only what all eight neighbours have, too, surely
-            covers the square. With one value a cell the neighbours do not count: ``tote_bearing`` says what carries.
+            it. Then a neighbour that it does not reach is lower. So only what all eight neighbours have, too, counts as
+            covering the square. A gap narrower than two squares is not seen. With one value a cell the neighbours do
+            not count: ``tote_bearing`` says what carries.
             "centre": a value was measured in the middle of its square. An edge may pass between two middles, so a
             square may have its own value or the value of any of its eight neighbours. A thing narrower than two squares
             may be missed.

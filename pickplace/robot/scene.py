@@ -62,8 +62,8 @@ class Scene:
     #: greatest distance between an item and its planned place, in any direction, at most ``clearance``; m; None: the
     #: clearance. A support counts only if it carries the item at all these places
     placement_error: float | None = None
-    #: the place whose height each value of a tote's map in metres gives, to within ``accuracy``: ``"area"``, all of its
-    #: square; or ``"centre"``, the point in its middle
+    #: the place whose height each value of a tote's map in metres gives, to within ``accuracy``: ``"area"``, the
+    #: highest of its square; or ``"centre"``, the point in its middle
     tote_samples: str = "area"
     tote_height: float | None = None  #: height of the tote's rim above its floor; None: from ``cell.tote_size``
     #: with ``support="bearing"``, ``[W_T, D_T]``, 1 where a cell bears weight, else 0: ``tote_bearing`` of the plan

@@ -102,7 +102,9 @@ class PlanRequest:
         "greatest distance of an item from where it is set down; m; default: the clearance", None, float
     )
     tote_samples: str = _key(
-        "what a value of tote_depth in metres holds for: area, all of its square; centre, its middle", "area", str
+        "what a value of tote_depth in metres holds for: area, the highest of its square; centre, its middle",
+        "area",
+        str,
     )
     alternatives: int = _key("number of most probable choices reported", 10, int)
     deadline: float = _key("greatest time until the answer, waiting included; s", DEADLINE, float)

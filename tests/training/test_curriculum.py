@@ -252,6 +252,7 @@ ERRORS = [
     # A user's rule.
     (lambda: play(make(Own(1.5)), 10), "advance: Own: its level=1.5: expected a whole number"),
     (lambda: play(make(Own(1, logs={"level": 7})), 10), "Own: it logs level, which the curriculum logs itself"),
+    (lambda: play(make(Own(1, logs={"occupancy_at_9": 7})), 10), "Own: it logs occupancy_at_9, which the curriculum"),
     (lambda: play(make(Own(1, logs={"mood": "good"})), 10), "Own: it logs mood='good': expected a number"),
     (lambda: make(Own(1, torch.tensor(1))), r"Own: its state has seen=tensor\(1\): expected what JSON holds"),
     (lambda: make(Own(1, float("nan"))), "Own: its state has seen=nan"),

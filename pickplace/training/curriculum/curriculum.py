@@ -2,6 +2,7 @@
 
 import logging
 import math
+import re
 from collections import deque
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
@@ -17,6 +18,7 @@ from pickplace.training.curriculum.levels import heights, read_levels
 from pickplace.training.curriculum.sample import Current
 
 log = logging.getLogger(__name__)
+OWN_MEAN = re.compile(r"occupancy(_at_\d+)?")  # means that the curriculum logs
 
 
 class Curriculum:
@@ -177,7 +179,7 @@ class Curriculum:
             **({"occupancy": tally.mean} if tally.window else {}),
             **{f"occupancy_at_{number}": mean for number, mean in means.items()},
         }
-        taken = ", ".join(sorted(logs.keys() & {*own, "occupancy"}))
+        taken = ", ".join(sorted(name for name in logs if name in own or OWN_MEAN.fullmatch(str(name))))
         refuse_if(taken, f"{self._rule}: it logs {taken}, which the curriculum logs itself; expected other names.")
         logs |= own
         if level != tally.level:
