@@ -135,7 +135,13 @@ def test_bodies_of_any_shape_touch_no_other_item(name, scenes):
             for (w, d, h), centre, yaw in scene.in_bin()
         ]
         tote = scene.tote_map(200, draw.uniform(-NOISE, NOISE, (60, 60)))
-        seen = {"tote_depth": tote, "tote_height": scene.tote[2], "cell_size": side, "accuracy": NOISE}
+        seen = {
+            "tote_depth": tote,
+            "tote_height": scene.tote[2],
+            "bin_height": scene.bin[2],
+            "cell_size": side,
+            "accuracy": NOISE,
+        }
         plan = plan_for(planner, items=boxes, **seen, alternatives=0)
         status = plan.status
         if status == "ok":
