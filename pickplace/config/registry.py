@@ -43,9 +43,9 @@ REGISTRY: dict[str, dict[str, str]] = {
     "env.gripper": _classes("rules.gripper.rules", contain="Contain", overlap="Overlap", seal="Seal"),
     "env.reach": _classes("rules.reach", annulus="annulus.Annulus", table="table.ReachTable"),
     "env.support": _classes(
-        "rules.support.rules", half="Half", more_than_half="MoreThanHalf", hull="Hull", bearing="Bearing",
-        half_or_hull="HalfOrHull", corners="Corners", cdrl="Cdrl", gopt="Gopt", full="Full",
-        share="Share",
+        "rules.support", half="rules.Half", more_than_half="rules.MoreThanHalf", hull="rules.Hull",
+        bearing="rules.Bearing", half_or_hull="rules.HalfOrHull", corners="rules.Corners", cdrl="rules.Cdrl",
+        gopt="rules.Gopt", full="rules.Full", share="rules.Share", pct="pct.Pct",
     ),
     "items": _classes(
         "items", kinds="distributions.Kinds", uniform="distributions.Uniform", recorded="distributions.Recorded",

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from pickplace.common.validate import refuse_if
@@ -58,7 +59,7 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
         value = saved[RESET_ENTRIES[key].field]
         check(key, (value >= low) & (value <= high), f"{low} to {high}")
     episode = EpisodeSettings(**{SETTINGS[key].field: saved[SETTINGS[key].field] for key in cell.varies})
-    pile = Pile(*(saved[key] for key in Pile._fields)) if cell.handling else None
+    pile = Pile(*(saved[key] for key in Pile._fields)) if cell.records_pile else None
     coming = Item.from_table(saved["coming"]) if cell.preview else None
     state = State(surface, tote_height, Item.from_table(saved["item"]), episode, pile, coming)
     heights = state.heights
@@ -103,7 +104,7 @@ def _is_possible(pile: Pile, steps: Tensor, heights: Tensor) -> Tensor:
         steps: int64 ``[N]``.
         heights: int32 ``[N, W_T, D_T]``.
     """
-    labels, spare, below = pile
+    labels, spare, below, boxes = pile
     there = torch.arange(spare.shape[1]) < steps[:, None]
     within = there[:, :, None] & there[:, None]
     earlier = within.tril(-1) | within & torch.eye(spare.shape[1], dtype=torch.bool)
@@ -112,9 +113,9 @@ def _is_possible(pile: Pile, steps: Tensor, heights: Tensor) -> Tensor:
     good &= (through == below).flatten(1).all(1)
     good &= ((spare >= 0) & (spare <= NO_LIMIT) & (there | (spare == 0))).all(1)
     seen = (labels >= 0) & (labels <= steps[:, None, None]) & ((labels > 0) == (heights > 0))
-    # All cells with the same item on top are level.
-    number = labels.flatten(1)
-    tops = torch.zeros(len(labels), spare.shape[1] + 1, dtype=heights.dtype)
-    tops.scatter_(1, number.clamp(0, spare.shape[1]), heights.flatten(1))
-    level = tops.gather(1, number.clamp(0, spare.shape[1])) == heights.flatten(1)
+    corner, size = boxes.split(3, 2)
+    good &= ((corner >= 0).all(2) & ((size > 0).all(2) == there)).all(1)
+    good &= (corner[..., :2] + size[..., :2] <= torch.tensor(heights.shape[1:])).flatten(1).all(1)
+    tops = F.pad(corner[..., 2] + size[..., 2], (1, 0))
+    level = tops.gather(1, labels.flatten(1).clamp(0, spare.shape[1])) == heights.flatten(1)
     return good & seen.flatten(1).all(1) & level.all(1)

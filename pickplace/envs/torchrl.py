@@ -129,7 +129,7 @@ class PickPlaceEnv(EnvBase):
             items.has_limits and not cell.handling,
             "env.handling=false: the items have greatest loads or turns of their own; expected env.handling=true.",
         )
-        if cell.handling:
+        if cell.records_pile:
             cell = replace(cell, most_items=most_items(cell, items))
         self.items, self.cell, self.terms = items, cell, check_terms(observation, cell)
         check_samples(cell, items, stream)
@@ -140,7 +140,7 @@ class PickPlaceEnv(EnvBase):
         self.cell = replace(cell, longest_side=longest_side(cell, items))
         device = usable_device(device)
         words = f"num_envs={num_envs}"
-        words += f" with handling=true and room for {cell.pile_room:,} items in a tote" if cell.handling else ""
+        words += f" with room for {cell.pile_room:,} items in a tote, which are recorded" if cell.records_pile else ""
         check_bytes(words, num_envs * problem_bytes(self.cell, masks), device)
         super().__init__(device=device, batch_size=[num_envs])
         self.stream, self.masks = stream, tuple(masks)
@@ -172,6 +172,7 @@ class PickPlaceEnv(EnvBase):
         def zeros(*shape, dtype=torch.int64):
             return torch.zeros(num_envs, *shape, dtype=dtype, device=self.device)
 
+        pile = Pile.empty(num_envs, cell.tote_size, cell.pile_room if cell.records_pile else 0, self.device)
         # All run-time state is in buffers, so that state_dict() contains it.
         buffers = {
             "surface": zeros(*cell.tote_size[:2], dtype=torch.int32) + EMPTY,
@@ -183,7 +184,7 @@ class PickPlaceEnv(EnvBase):
             "episode": zeros(),
             "item_seed": torch.tensor(0, device=self.device),
             "feasible": zeros(dtype=torch.bool),
-            **(Pile.empty(num_envs, cell.tote_size, cell.pile_room, self.device)._asdict() if cell.handling else {}),
+            **(pile._asdict() if cell.records_pile else {}),
             **{RESET_ENTRIES[key].field: zeros() + RESET_ENTRIES[key].full(cell) for key in self.limits},
             **{name: zeros(size, dtype=torch.bool) for name, size in sizes.items()},
         }
@@ -313,7 +314,7 @@ class PickPlaceEnv(EnvBase):
 
     @property
     def _pile(self) -> Pile | None:
-        return Pile(*map(self.get_buffer, Pile._fields)) if self.cell.handling else None
+        return Pile(*map(self.get_buffer, Pile._fields)) if self.cell.records_pile else None
 
     @property
     def _episode_settings(self) -> EpisodeSettings:

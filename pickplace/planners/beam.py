@@ -106,7 +106,7 @@ class Beam(MapPlanner):
         """
         row, choice = mask.nonzero(as_tuple=True)
         at_once = max(
-            1, CELLS_AT_ONCE // (plans.state.surface[0].numel() + self.cell.handling * self.cell.pile_room**2)
+            1, CELLS_AT_ONCE // (plans.state.surface[0].numel() + self.cell.records_pile * self.cell.pile_room**2)
         )
         parts = [self._judge(plans, *some) for some in zip(row.split(at_once), choice.split(at_once), strict=True)]
         placed, total, outcome = map(torch.cat, zip(*parts, strict=True))

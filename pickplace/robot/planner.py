@@ -24,7 +24,7 @@ from pickplace.policies.base import MASKED, Policy, Ranking, ScoresActions, Scor
 from pickplace.policies.restore import load_critic, load_policy
 from pickplace.robot.box import Box, DepthMapError
 from pickplace.robot.measured_problem import read_metric
-from pickplace.robot.problem import Pose, Problem, read_grid
+from pickplace.robot.problem import Pose, Problem, check_robot_cell, read_grid
 from pickplace.robot.scene import Scene
 from pickplace.robot.training_envelope import TrainingEnvelope
 from pickplace.rules.cell import CellSpec
@@ -127,7 +127,7 @@ class Planner:
         training: TrainingEnvelope | None = None,
         critic=None,
     ):
-        refuse_if(cell.tipping, "env.tipping=true: a robot's gripper does not tip items; expected false.")
+        check_robot_cell(cell)
         self._handling = cell.handling
         cell = replace(cell, handling=False, preview=0)  # each scene has its own loads and preview
         loads = [key for key, term in (terms or {}).items() if key in HANDLING_TERMS or isinstance(term, ToteCapacity)]

@@ -220,6 +220,16 @@ def read_grid(cell: CellSpec, scene: Scene, device, exclude: Sequence[Sequence[f
     )  # fmt: skip
 
 
+def check_robot_cell(cell: CellSpec) -> None:
+    """Refuse a cell that no robot can have; raise ``ValueError``."""
+    refuse_if(cell.tipping, "env.tipping=true: a robot's gripper does not tip items; expected false.")
+    refuse_if(
+        cell.support.sees_boxes,
+        f"env.support={cell.support}: it looks at all boxes in the tote, which images do not show; expected another "
+        "rule, such as bearing.",
+    )
+
+
 def join_items(items: list[Item]) -> Item:
     """Join items ``[1]`` to the items of one bin, ``[1, M]``."""
     return Item(*(torch.stack(parts, 1) for parts in zip(*items, strict=True)))

@@ -63,7 +63,7 @@ class CellSpec:
         longest_side: longest side of any item, if known; no item may be longer. It saves time. Unless the gripper
             limits the size of items, it also sets the number of offsets.
         most_items: greatest number of items in a tote, if known; else there is room for one in each cell and height
-            unit. Used only with ``handling``.
+            unit. Used only if the pile is recorded.
         varies: settings in which episodes may differ, besides the height of the tote: names of
             :data:`~pickplace.rules.observation.EPISODE_TERMS`. The observation has an entry for each.
         item_inset: cells at each edge of the item, along x and y, that a measured item may cover only in part; see
@@ -180,6 +180,11 @@ class CellSpec:
     def forbids_turns(self) -> bool:
         """Whether some rotations may be forbidden; see ``turns`` of an :class:`~pickplace.rules.item.Item`."""
         return self.handling or "rotations" in self.varies
+
+    @property
+    def records_pile(self) -> bool:
+        """Whether a state has the :class:`~pickplace.rules.pile.Pile` in the tote: for loads, or the stability rule."""
+        return self.handling or self.support.sees_boxes
 
     @property
     def pile_room(self) -> int:

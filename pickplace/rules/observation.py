@@ -14,7 +14,7 @@ from torch import Tensor
 from pickplace.common.validate import expect, number, refuse_if, short_text
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import NO_LIMIT, Item, bin_depth_from_items, bin_labels_from_items, flags_from_turns
-from pickplace.rules.state import State
+from pickplace.rules.state import PILE_KEYS, State
 
 PAPER_CELL = CellSpec()
 MAX_NUMBER = 2**31 - 1  # greatest value of an :class:`EpisodeNumber`
@@ -124,10 +124,10 @@ class Handling(Term):
 
 
 class PilePart(Term):
-    """A part of the :class:`~pickplace.rules.pile.Pile` of the items in the tote, in cells with ``handling``.
+    """A part of the :class:`~pickplace.rules.pile.Pile` of the items in the tote, in cells that record it.
 
     Args:
-        key: name of the part: ``"labels"``, ``"spare"`` or ``"below"``.
+        key: name of the part: ``"labels"``, ``"spare"``, ``"below"`` or ``"boxes"``.
     """
 
     def __init__(self, key: str):
@@ -139,6 +139,7 @@ class PilePart(Term):
             "labels": Bounds(0, room, cell.tote_size[:2], torch.int64),
             "spare": Bounds(0, NO_LIMIT, (room,), torch.int64),
             "below": Bounds(0, 1, (room, room), torch.bool),
+            "boxes": Bounds(0, max(cell.tote_size), (room, 6), torch.int64),
         }[self.key]
 
     def value(self, cell, state):
@@ -161,7 +162,7 @@ class ToteCapacity(Term):
         return Bounds(-1e-3, self.most, cell.tote_size[:2])
 
     def value(self, cell, state):
-        refuse_if(state.pile is None, "tote_capacity: there are no loads; expected env.handling=true.")
+        refuse_if(not cell.handling, "tote_capacity: there are no loads; expected env.handling=true.")
         return (state.pile.capacity / 1000).clamp(max=self.most).float()
 
 
@@ -236,13 +237,9 @@ STANDARD_TERMS: Mapping[str, Term] = {
     "tote_height": ToteHeight(),
 }
 
-#: Further entries of every observation in cells with ``handling``.
-HANDLING_TERMS: Mapping[str, Term] = {
-    "handling": Handling(),
-    "tote_labels": PilePart("labels"),
-    "pile_spare": PilePart("spare"),
-    "pile_below": PilePart("below"),
-}
+#: Further entries of every observation in cells that record the pile, and in cells with ``handling``.
+PILE_TERMS: Mapping[str, Term] = {key: PilePart(key.partition("_")[2]) for key in PILE_KEYS}
+HANDLING_TERMS: Mapping[str, Term] = {"handling": Handling(), **PILE_TERMS}
 
 #: Entries that only some cells have. From their presence the rules know the cell.
 OPTIONAL_TERMS: Mapping[str, Term] = {
@@ -262,8 +259,8 @@ def standard_terms(cell: CellSpec) -> dict[str, Term]:
     """Return the terms that an observation of a cell always has."""
     several: dict[str, Term] = {"bin_labels": BinLabels(), "items": Items()} if cell.bin_items > 1 else {}
     coming = {"coming": Coming()} if cell.preview else {}
-    handling = HANDLING_TERMS if cell.handling else {}
-    return {**STANDARD_TERMS, **several, **coming, **handling, **{key: EPISODE_TERMS[key] for key in cell.varies}}
+    pile = HANDLING_TERMS if cell.handling else PILE_TERMS if cell.records_pile else {}
+    return {**STANDARD_TERMS, **several, **coming, **pile, **{key: EPISODE_TERMS[key] for key in cell.varies}}
 
 
 def item_keys(bin_items: int) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 Surfaces, see :func:`~pickplace.rules.state.surface_from`, are halved where heights are needed.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property, lru_cache, reduce
 from itertools import product
 
@@ -17,7 +17,7 @@ from pickplace.rules.gripper.base import EffectorShape
 from pickplace.rules.item import Item
 from pickplace.rules.maps import FAR, NEVER, is_under, rectangle_sums, surround, windows
 from pickplace.rules.state import surface_from
-from pickplace.rules.support.contact import Contact
+from pickplace.rules.support.contact import Contact, Neighbours
 
 MIN_SIDE = 8  # side of the square under an item from which :class:`LargeFootprintContact` is faster
 MAX_LEVELS = 2**22  # entries of its tables; further problems follow in turn
@@ -25,11 +25,13 @@ FOOTPRINTS_AT_ONCE = {"cpu": 2**17, "cuda": 2**24}  # as many as a CPU's caches 
 
 
 def resting_top(
-    cell: CellSpec, surface: Tensor, tote_height: Tensor, item: Item, capacity: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
+    cell: CellSpec, surface: Tensor, tote_height: Tensor, item: Item, capacity: Tensor | None = None,
+    boxes: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Return the height of the item's top on every footprint, and of its underside, int32 ``[N, Q, W_T, D_T]`` each.
 
-    Arguments: see :meth:`~pickplace.rules.state.State.each_item` and :attr:`~pickplace.rules.state.State.capacity`.
+    Arguments: see :meth:`~pickplace.rules.state.State.each_item`, :attr:`~pickplace.rules.state.State.capacity` and
+    :attr:`~pickplace.rules.state.State.boxes`.
 
     The top is ``NEVER`` where the item cannot rest: the footprint leaves the tote, the top passes the rim, the support
     is too small, or something below would be overloaded. The underside is given whether the item is stable or not, and
@@ -37,7 +39,13 @@ def resting_top(
     """
     w, d = footprint_sizes(cell, item)
     at_once = max(1, FOOTPRINTS_AT_ONCE.get(surface.device.type, 2**24) // cell.num_footprints)
-    parts = zip(surface.split(at_once), w.split(at_once, -1), d.split(at_once, -1), strict=True)
+    around: Sequence = [None] * -(-len(surface) // at_once)
+    if boxes is not None:
+        pairs = zip(boxes.split(at_once), item.h.split(at_once), strict=True)
+        corner = (torch.arange(side, device=surface.device) for side in surface.shape[1:])
+        x, y = (each[..., None] for each in torch.meshgrid(*corner, indexing="ij"))
+        around = [Neighbours(some, x, y, h) for some, h in pairs]
+    parts = zip(surface.split(at_once), w.split(at_once, -1), d.split(at_once, -1), around, strict=True)
     kind = FootprintContact if cell.max_side < MIN_SIDE else LargeFootprintContact
     contacts = (kind(cell, *part) for part in parts)  # one at a time, for the memory
     found: list[tuple[Tensor, ...]]
@@ -53,9 +61,7 @@ def resting_top(
     return torch.where(good, top, NEVER).permute(3, 0, 1, 2), z.permute(3, 0, 1, 2)
 
 
-def unchecked_top(
-    cell: CellSpec, surface: Tensor, tote_height: Tensor, item: Item, capacity: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
+def unchecked_top(cell: CellSpec, surface: Tensor, tote_height: Tensor, item: Item, *_) -> tuple[Tensor, Tensor]:
     """Return the same as :func:`resting_top`, but the top of every footprint in the tote, without any check."""
     z = FootprintContact(cell, surface, *footprint_sizes(cell, item)).z
     return (z + item.h.to(z.dtype)).permute(3, 0, 1, 2), z.permute(3, 0, 1, 2)
@@ -75,10 +81,12 @@ class FootprintContact(Contact):
     Args:
         surface: int32 ``[N, W_T, D_T]``.
         w, d: see :func:`footprint_sizes`.
+        recorded: see :class:`~pickplace.rules.support.contact.Contact`.
     """
 
-    def __init__(self, cell: CellSpec, surface: Tensor, w: Tensor, d: Tensor):
+    def __init__(self, cell: CellSpec, surface: Tensor, w: Tensor, d: Tensor, recorded: Neighbours | None = None):
         self.surface, self.side, self.w, self.d = surface.permute(1, 2, 0), cell.max_side, w, d
+        self.recorded = recorded
         self.padded = surround(self.surface, (0, self.side - 1, 0, self.side - 1), 2 * FAR)
         # The maximum over a rectangle is a maximum along one axis, then along the other.
         self.z = self._highest(self._highest(self.padded[None], -3, w), -2, d) >> 1

@@ -21,7 +21,7 @@ from pickplace.rules.item import NO_LIMIT, Item, flags_from_turns
 from pickplace.rules.maps import NEVER, is_under, rectangle, square_cells
 from pickplace.rules.pile import Pile
 from pickplace.rules.state import State, surface_from
-from pickplace.rules.support.contact import Contact
+from pickplace.rules.support.contact import Contact, Neighbours
 
 
 class Step(NamedTuple):
@@ -50,7 +50,7 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     taken, item, blocked = take_item(cell, items, action)
     picked, rotation, (left, front, wide, deep), (x, y, w, d) = carry(cell, item, action, blocked)
     # Cells outside the tote do not matter: an item there fails, and some cell of the end effector is always inside.
-    contact, index = _contact(cell, surface, x, y, w, d)
+    contact, index = _contact(cell, surface, x, y, w, d, None if pile is None else Neighbours(pile.boxes, x, y, item.h))
     top, reach = contact.z.long() + item.h, max(ee_w, ee_d)
     covered = body_cells(cell.effectors, reach, action.device)  # [reach * reach, B]
     if len(cell.effectors) > 1:
@@ -103,19 +103,22 @@ def put_down(cell: CellSpec, state: State, choice: Tensor) -> tuple[State, Item]
     return state._replace(surface=surface, items=remove_item(cell, state.items, taken), pile=pile), item
 
 
-def _contact(cell: CellSpec, surface: Tensor, x: Tensor, y: Tensor, w: Tensor, d: Tensor) -> tuple[Contact, Tensor]:
+def _contact(
+    cell: CellSpec, surface: Tensor, x: Tensor, y: Tensor, w: Tensor, d: Tensor, recorded: Neighbours | None = None
+) -> tuple[Contact, Tensor]:
     """Return the supporting cells under items on footprints, and the flat cells of the squares there.
 
     Args:
         surface: int32 ``[N, W_T, D_T]``.
         x, y, w, d: minimum corner and sides of the footprints, int64 ``[N]``.
+        recorded: see :class:`~pickplace.rules.support.contact.Contact`.
 
     Returns:
         the contact, with quantities ``[N]``; int64 ``[S * S, N]``, see :func:`~pickplace.rules.maps.square_cells`.
     """
     index = square_cells(surface.shape[1:], x, y, cell.max_side)
     cells, under = surface.flatten(1).t().gather(0, index), is_under(w, d, cell.max_side)
-    return Contact(cells, under, torch.where(under, cells, NEVER).amax(0) >> 1, w, d), index
+    return Contact(cells, under, torch.where(under, cells, NEVER).amax(0) >> 1, w, d, recorded), index
 
 
 def _least_capacity(pile: Pile, contact: Contact, index: Tensor) -> Tensor:
@@ -151,5 +154,6 @@ def _add_item(
         weak = contact.under & added & ~cell.support.bearing(contact)
         after.scatter_add_(0, index, -weak.int())
     if pile is not None:
-        pile = pile.add(item, index, _touched(contact), inside.permute(2, 0, 1))
+        box = torch.stack([x, y, contact.z.long(), contact.w, contact.d, height], -1)
+        pile = pile.add(item, index, _touched(contact), inside.permute(2, 0, 1), box)
     return after.t().unflatten(1, grid).contiguous(), pile

@@ -1,6 +1,7 @@
 """The stability rule of a cell as an object: the base class of all rules."""
 
 from abc import ABC, abstractmethod
+from typing import ClassVar
 
 from torch import Tensor
 
@@ -12,6 +13,9 @@ class Support(ABC):
 
     A subclass is a frozen dataclass, whose fields are the rule's settings.
     """
+
+    #: Whether the rule looks at the items in the tote, ``contact.neighbours``. The environment then records them.
+    sees_boxes: ClassVar[bool] = False
 
     @abstractmethod
     def stable(self, contact: Contact) -> Tensor:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from functools import cached_property
 from itertools import chain, product
 from math import inf
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -14,6 +15,15 @@ from torch import Tensor
 
 from pickplace.rules.state import surface_from
 from pickplace.rules.support.hull import COVERED, PATTERN_SIDE, exact_dtype, hull_arcs, hull_patterns
+
+
+class Neighbours(NamedTuple):
+    """What else is in the tote, and where the item is among it; for rules with ``sees_boxes``."""
+
+    boxes: Tensor  # int64 [N, L, 6]: x, y, z, w, d, h of the items in the tote, in their order, then zeros
+    x: Tensor  # minimum corner of the footprint, broadcastable to the shape of ``Contact.z``, whose last axis is N
+    y: Tensor
+    h: Tensor  # height of the item, broadcastable to that shape
 
 
 class Contact:
@@ -25,15 +35,25 @@ class Contact:
         under: whether the item covers these cells, bool, broadcastable.
         z: the height on which the item rests, int32.
         w, d: the footprint's sides, broadcastable; 0 for no item.
+        recorded: what else is in the tote, for rules with ``sees_boxes``; None: it is not known.
 
     Attributes:
         supporting: the surface of a supporting cell, int32 of the shape of ``z``.
         side: ``S``, side of the square.
     """
 
-    def __init__(self, surfaces: Tensor, under: Tensor, z: Tensor, w: Tensor, d: Tensor):
-        self.surfaces, self.under, self.z, self.w, self.d = surfaces, under, z, w, d
+    def __init__(
+        self, surfaces: Tensor, under: Tensor, z: Tensor, w: Tensor, d: Tensor, recorded: Neighbours | None = None
+    ):
+        self.surfaces, self.under, self.z, self.w, self.d, self.recorded = surfaces, under, z, w, d, recorded
         self.supporting, self.side = surface_from(z), round(len(under) ** 0.5)
+
+    @property
+    def neighbours(self) -> Neighbours:
+        """What else is in the tote; raise ``ValueError`` if it is not known."""
+        if self.recorded is None:
+            raise ValueError("The state has no pile, but the stability rule looks at it: expected State.pile.")
+        return self.recorded
 
     def cells(self) -> Iterator[Tensor]:
         """Yield for each cell of the square, row by row, whether it supports the item, bool of the shape of ``z``."""

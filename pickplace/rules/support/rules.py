@@ -9,6 +9,7 @@ from torch import Tensor
 from pickplace.common.validate import is_number, number, one_of
 from pickplace.rules.support.base import Support
 from pickplace.rules.support.contact import Contact, Patches
+from pickplace.rules.support.pct import Pct
 
 
 @dataclass(frozen=True)
@@ -164,6 +165,7 @@ RULES: dict[str, type[Support]] = {
     "cdrl": Cdrl,
     "gopt": Gopt,
     "full": Full,
+    "pct": Pct,
 }
 
 
