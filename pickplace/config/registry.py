@@ -45,7 +45,7 @@ REGISTRY: dict[str, dict[str, str]] = {
     "env.support": _classes(
         "rules.support", half="rules.Half", more_than_half="rules.MoreThanHalf", hull="rules.Hull",
         bearing="rules.Bearing", half_or_hull="rules.HalfOrHull", corners="rules.Corners", cdrl="rules.Cdrl",
-        gopt="rules.Gopt", full="rules.Full", share="rules.Share", pct="pct.Pct",
+        gopt="rules.Gopt", full="rules.Full", pct="pct.Pct", share="rules.Share",
     ),
     "items": _classes(
         "items", kinds="distributions.Kinds", uniform="distributions.Uniform", recorded="distributions.Recorded",

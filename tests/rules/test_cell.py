@@ -25,7 +25,7 @@ from pickplace.rules.support.rules import Hull
         ({"pick_rule": "grab"}, "pick_rule='grab': expected 'contain' or 'overlap' or 'seal'"),
         ({"gripper": "seal"}, "gripper='seal': expected a Gripper"),
         *(
-            ({"support": value}, f"support={value!r}: expected 'half' or .* 'full' or a number between 0 and 1")
+            ({"support": value}, f"support={value!r}: expected 'half' or .* 'pct' or a number between 0 and 1")
             for value in (1.5, -0.1, "most", True)
         ),
         *(({"height_unit": value}, f"height_unit={value}: .* between 0.001 and 1000") for value in (1e-4, 2000)),

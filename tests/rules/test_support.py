@@ -66,7 +66,7 @@ def test_large_items_touch_what_small_ones_do(side, seed):
     inside = small.z < FAR
     for quantity in ("count", "share", "num_supported_corners", "num_level_corners"):
         assert torch.equal(getattr(small, quantity)[inside], getattr(large, quantity)[inside]), quantity
-    for name in RULES:
+    for name in (name for name, rule in RULES.items() if not rule.sees_boxes):
         assert torch.equal(RULES[name]().stable(small)[inside], RULES[name]().stable(large)[inside]), name
 
 

@@ -6,7 +6,6 @@ from functools import lru_cache
 from math import inf, nan, sqrt
 from typing import NamedTuple, TypeAlias
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -185,13 +184,13 @@ def _least_squares(centre: Point, middles: Sequence[Point]) -> list[float]:
             from_i, from_j = (
                 (centre[0] - end[0]) * along[0] + (centre[1] - end[1]) * along[1] for end in (middles[i], middles[j])
             )
-            row = np.zeros(count)
+            row = [0.0] * count
             if from_i != 0:
-                row[[i, j]] = 1, -abs(from_j) / from_i
+                row[i], row[j] = 1.0, -abs(from_j) / from_i
             rows.append(row)
-    system, sums = np.stack([*rows, np.ones(count)]), np.zeros(len(rows) + 1)
-    sums[-1] = 1
-    return np.linalg.lstsq(system, sums, rcond=None)[0].tolist()
+    system = torch.tensor([*rows, [1.0] * count], dtype=torch.float64)
+    sums = torch.tensor([*[0.0] * len(rows), 1.0], dtype=torch.float64)[:, None]
+    return torch.linalg.lstsq(system, sums, driver="gelsd").solution[:, 0].tolist()
 
 
 def _hull(corners: Iterable[Point]) -> list[Point]:
