@@ -110,7 +110,7 @@ class SampledPPO(PPO):
         state = State.from_observation(frames).rows(row)
         seen = frames.select(*self.policy.act_keys)[row]
         step = apply(cell, state, self.policy.to_action(candidates.flatten(), seen))
-        after = state._replace(surface=step.surface, items=items.rows(row), pile=step.pile)
+        after = state._replace(surface=step.surface, items=items.rows(row), pile=step.pile, boxes=step.boxes)
         placed = step.failure == 0
         goes_on = placed & footprint_mask(cell, placing_maps(cell, after)).flatten(1).any(1)
         value = placed * step.item.volume * self.task.reward_scale

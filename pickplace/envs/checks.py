@@ -16,7 +16,6 @@ from pickplace.rules.cell import CellSpec
 from pickplace.rules.grasps import available_offsets
 from pickplace.rules.item import ALL_TURNS, Item
 from pickplace.rules.masks import footprint_mask, placing_maps
-from pickplace.rules.pile import Pile
 from pickplace.rules.state import EMPTY, State
 
 MAX_POSITIONS = 2_000_000  # of items in the bin, all kinds together, that are checked one by one
@@ -26,7 +25,7 @@ def problem_bytes(cell: CellSpec, masks: Collection[str]) -> int:
     """Return about the number of bytes of one problem's masks and of the tensors from which they are computed."""
     offsets = cell.num_offsets**2
     count = 64 * cell.num_footprints + 32 * cell.rotations * (offsets + cell.num_picks)
-    count += cell.records_pile * (16 * cell.num_footprints + 10 * cell.pile_room**2)
+    count += cell.handling * (16 * cell.num_footprints + 10 * cell.room**2) + cell.support.sees_boxes * 200 * cell.room
     return cell.bin_items * (count + ("action" in masks) * (4 * cell.num_actions + 8 * offsets * cell.num_places))
 
 
@@ -140,8 +139,8 @@ def check_items(cell: CellSpec, items: ItemDistribution, mix: int = 0, turns: in
     for chunk in rows[list(distinct.values())].split(max(1, min(1024, 2**24 // cell.num_footprints))):
         empty = torch.full((len(chunk), *cell.tote_size[:2]), EMPTY, dtype=torch.int32)
         item = Item.from_table(chunk[:, None, :5])._replace(turns=chunk[:, None, 5])
-        pile = Pile.empty(len(chunk), cell.tote_size, 1) if cell.records_pile else None
-        maps = placing_maps(cell, State(empty, torch.full((len(chunk),), height), item, pile=pile))
+        boxes = empty.new_zeros(len(chunk), 0, 6, dtype=torch.int64) if cell.support.sees_boxes else None
+        maps = placing_maps(cell, State(empty, torch.full((len(chunk),), height), item, boxes=boxes))
         feasible = footprint_mask(cell, maps).flatten(1).any(1)
         if not feasible.all():
             x, y, *_, kind = chunk[~feasible][0].tolist()

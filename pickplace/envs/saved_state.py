@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from pickplace.common.validate import refuse_if
@@ -14,6 +13,7 @@ from pickplace.items.distributions import MAX_SEED
 from pickplace.items.tipping import sizes_in_bin, tipped_items
 from pickplace.rules.bin import select_item
 from pickplace.rules.item import NO_LIMIT, Item, bin_labels_from_items
+from pickplace.rules.maps import rectangle
 from pickplace.rules.observation import observe, standard_terms
 from pickplace.rules.pile import Pile
 from pickplace.rules.state import EpisodeSettings, State
@@ -59,9 +59,10 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
         value = saved[RESET_ENTRIES[key].field]
         check(key, (value >= low) & (value <= high), f"{low} to {high}")
     episode = EpisodeSettings(**{SETTINGS[key].field: saved[SETTINGS[key].field] for key in cell.varies})
-    pile = Pile(*(saved[key] for key in Pile._fields)) if cell.records_pile else None
+    pile = Pile(*(saved[key] for key in Pile._fields)) if cell.handling else None
     coming = Item.from_table(saved["coming"]) if cell.preview else None
-    state = State(surface, tote_height, Item.from_table(saved["item"]), episode, pile, coming)
+    boxes = saved["boxes"] if cell.support.sees_boxes else None
+    state = State(surface, tote_height, Item.from_table(saved["item"]), episode, pile, coming, boxes)
     heights = state.heights
     check("surface", (heights >= 0) & (heights <= tote_height[:, None, None]), "heights of 0 to tote_height")
     check("surface", state.bearing | ((heights > 0) & cell.support.marks_bearing), "cells that bear weight")
@@ -69,6 +70,8 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
     check("steps", (steps >= 0) & (steps <= volume), "at most one for each unit of volume")
     if pile is not None:
         check("pile", _is_possible(pile, steps, heights), "what lies on what after so many placements")
+    if boxes is not None:
+        check("boxes", _are_possible(boxes, steps, heights), "the boxes under the surface")
     check("episode", number >= 0, "at least 0")
     check("item_seed", (seed >= 0) & (seed < MAX_SEED), "at least 0 and below 2**62")
     items, limits = state.items, torch.tensor(cell.bin_size[:2])
@@ -97,6 +100,17 @@ def _check_saved_state(env: PickPlaceEnv, saved: Mapping[str, Tensor], carried: 
         check(f"the carried {key}", close, "what the state shows")
 
 
+def _are_possible(boxes: Tensor, steps: Tensor, heights: Tensor) -> Tensor:
+    """Return whether boxes are possible in totes with ``steps`` items, bool ``[N]``; see :func:`_is_possible`."""
+    there = torch.arange(boxes.shape[1]) < steps[:, None]
+    x, y, z, w, d, h = boxes.unbind(2)
+    good = ((boxes[..., 3:] > 0).all(2) == there) & (boxes >= 0).all(2) & (there | (boxes == 0).all(2))
+    good &= (x + w <= heights.shape[1]) & (y + d <= heights.shape[2])
+    covered = rectangle(heights.shape[1:], *(part.flatten() for part in (x, y, w, d)))  # [W_T, D_T, N * L]
+    tops = (covered * (z + h).flatten()).unflatten(2, boxes.shape[:2]).amax(3).permute(2, 0, 1)
+    return good.all(1) & (tops == heights).flatten(1).all(1)
+
+
 def _is_possible(pile: Pile, steps: Tensor, heights: Tensor) -> Tensor:
     """Return whether piles are possible in totes with ``steps`` items, bool ``[N]``.
 
@@ -104,7 +118,7 @@ def _is_possible(pile: Pile, steps: Tensor, heights: Tensor) -> Tensor:
         steps: int64 ``[N]``.
         heights: int32 ``[N, W_T, D_T]``.
     """
-    labels, spare, below, boxes = pile
+    labels, spare, below = pile
     there = torch.arange(spare.shape[1]) < steps[:, None]
     within = there[:, :, None] & there[:, None]
     earlier = within.tril(-1) | within & torch.eye(spare.shape[1], dtype=torch.bool)
@@ -113,9 +127,9 @@ def _is_possible(pile: Pile, steps: Tensor, heights: Tensor) -> Tensor:
     good &= (through == below).flatten(1).all(1)
     good &= ((spare >= 0) & (spare <= NO_LIMIT) & (there | (spare == 0))).all(1)
     seen = (labels >= 0) & (labels <= steps[:, None, None]) & ((labels > 0) == (heights > 0))
-    corner, size = boxes.split(3, 2)
-    good &= ((corner >= 0).all(2) & ((size > 0).all(2) == there)).all(1)
-    good &= (corner[..., :2] + size[..., :2] <= torch.tensor(heights.shape[1:])).flatten(1).all(1)
-    tops = F.pad(corner[..., 2] + size[..., 2], (1, 0))
-    level = tops.gather(1, labels.flatten(1).clamp(0, spare.shape[1])) == heights.flatten(1)
+    # All cells with the same item on top are level.
+    number = labels.flatten(1)
+    tops = torch.zeros(len(labels), spare.shape[1] + 1, dtype=heights.dtype)
+    tops.scatter_(1, number.clamp(0, spare.shape[1]), heights.flatten(1))
+    level = tops.gather(1, number.clamp(0, spare.shape[1])) == heights.flatten(1)
     return good & seen.flatten(1).all(1) & level.all(1)

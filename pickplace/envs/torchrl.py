@@ -129,7 +129,7 @@ class PickPlaceEnv(EnvBase):
             items.has_limits and not cell.handling,
             "env.handling=false: the items have greatest loads or turns of their own; expected env.handling=true.",
         )
-        if cell.records_pile:
+        if cell.handling or cell.support.sees_boxes:
             cell = replace(cell, most_items=most_items(cell, items))
         self.items, self.cell, self.terms = items, cell, check_terms(observation, cell)
         check_samples(cell, items, stream)
@@ -140,7 +140,7 @@ class PickPlaceEnv(EnvBase):
         self.cell = replace(cell, longest_side=longest_side(cell, items))
         device = usable_device(device)
         words = f"num_envs={num_envs}"
-        words += f" with room for {cell.pile_room:,} items in a tote, which are recorded" if cell.records_pile else ""
+        words += f" with handling=true and room for {cell.room:,} items in a tote" if cell.handling else ""
         check_bytes(words, num_envs * problem_bytes(self.cell, masks), device)
         super().__init__(device=device, batch_size=[num_envs])
         self.stream, self.masks = stream, tuple(masks)
@@ -172,7 +172,6 @@ class PickPlaceEnv(EnvBase):
         def zeros(*shape, dtype=torch.int64):
             return torch.zeros(num_envs, *shape, dtype=dtype, device=self.device)
 
-        pile = Pile.empty(num_envs, cell.tote_size, cell.pile_room if cell.records_pile else 0, self.device)
         # All run-time state is in buffers, so that state_dict() contains it.
         buffers = {
             "surface": zeros(*cell.tote_size[:2], dtype=torch.int32) + EMPTY,
@@ -184,7 +183,8 @@ class PickPlaceEnv(EnvBase):
             "episode": zeros(),
             "item_seed": torch.tensor(0, device=self.device),
             "feasible": zeros(dtype=torch.bool),
-            **(pile._asdict() if cell.records_pile else {}),
+            **(Pile.empty(num_envs, cell.tote_size, cell.room, self.device)._asdict() if cell.handling else {}),
+            **({"boxes": zeros(cell.room, 6)} if cell.support.sees_boxes else {}),
             **{RESET_ENTRIES[key].field: zeros() + RESET_ENTRIES[key].full(cell) for key in self.limits},
             **{name: zeros(size, dtype=torch.bool) for name, size in sizes.items()},
         }
@@ -235,7 +235,7 @@ class PickPlaceEnv(EnvBase):
         self.item.masked_fill_(rows[:, None, None], 0)
         for count in (self.arrived, self.volume, self.steps):
             count.masked_fill_(rows, 0)
-        for part in self._pile or ():
+        for part in (*(self._pile or ()), *([] if self._boxes is None else [self._boxes])):
             part.masked_fill_(rows.view(-1, *[1] * (part.dim() - 1)), 0)
         self._refill(rows, self.state.items)
         self._update_masks(rows, empty=True)
@@ -283,6 +283,8 @@ class PickPlaceEnv(EnvBase):
         self.surface.copy_(step.surface)
         for part, after in zip(self._pile or (), step.pile or (), strict=True):
             part.copy_(after)
+        if step.boxes is not None:
+            self.get_buffer("boxes").copy_(step.boxes)
         self.volume.add_(gained)
         self.steps.add_(placed)
         items = self._refill(placed, remove_item(self.cell, state.items, step.taken, placed))
@@ -310,11 +312,15 @@ class PickPlaceEnv(EnvBase):
     def state(self) -> State:
         """The state of all problems."""
         items, coming = Item.from_table(self.item), Item.from_table(self.coming) if self.cell.preview else None
-        return State(self.surface, self.tote_height, items, self._episode_settings, self._pile, coming)
+        return State(self.surface, self.tote_height, items, self._episode_settings, self._pile, coming, self._boxes)
 
     @property
     def _pile(self) -> Pile | None:
-        return Pile(*map(self.get_buffer, Pile._fields)) if self.cell.records_pile else None
+        return Pile(*map(self.get_buffer, Pile._fields)) if self.cell.handling else None
+
+    @property
+    def _boxes(self) -> Tensor | None:
+        return self.get_buffer("boxes") if self.cell.support.sees_boxes else None
 
     @property
     def _episode_settings(self) -> EpisodeSettings:

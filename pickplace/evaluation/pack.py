@@ -219,7 +219,7 @@ class OrderPacker:
         fills = [Filling(each, self.cell_mm, np.zeros(cell.tote_size[:2])) for each in recordings]
         surface = torch.full((len(tries), *cell.tote_size[:2]), EMPTY, dtype=torch.int32)
         height = torch.full((len(tries),), cell.tote_size[2])
-        pile = Pile.empty(len(tries), cell.tote_size, cell.pile_room) if cell.handling else None
+        pile = Pile.empty(len(tries), cell.tote_size, cell.room) if cell.handling else None
         # Of each try: the kinds of items that found no place since an item was last put down.
         placeless: list[set[tuple]] = [set() for _ in tries]
         for items in zip(*(sequence for sequence, _ in tries), strict=True):

@@ -105,9 +105,7 @@ class Beam(MapPlanner):
             mask: the choices by which each plan may be extended, at least one in all, bool ``[P, choices]``.
         """
         row, choice = mask.nonzero(as_tuple=True)
-        at_once = max(
-            1, CELLS_AT_ONCE // (plans.state.surface[0].numel() + self.cell.records_pile * self.cell.pile_room**2)
-        )
+        at_once = max(1, CELLS_AT_ONCE // (plans.state.surface[0].numel() + self.cell.handling * self.cell.room**2))
         parts = [self._judge(plans, *some) for some in zip(row.split(at_once), choice.split(at_once), strict=True)]
         placed, total, outcome = map(torch.cat, zip(*parts, strict=True))
         different = _first_of_each(outcome)
@@ -157,11 +155,13 @@ def _first_of_each(value: Tensor) -> Tensor:
 
 def _fingerprint(problem: Tensor, state: State) -> Tensor:
     """Return a hash of each of ``P`` states, int64 ``[P]``. It is equal for equal problems, totes, loads that they can
-    still bear, sets of items in the bin, and items to come. Other pairs of states are equal with probability 2**-64."""
+    still bear, boxes in them if they are recorded, sets of items in the bin, and items to come. Other pairs of states
+    are equal with probability 2**-64."""
     table = state.items.table
     each = _mixed(_weighted(table)) * state.items.exists
     maps = [state.surface] if state.pile is None else [state.surface, state.pile.capacity]
     maps += [] if state.coming is None else [state.coming.table]
+    maps += [] if state.boxes is None else [state.boxes]
     parts = [problem, *(_mixed(_weighted(part.flatten(1))) for part in maps), each.sum(1)]
     return _mixed(_weighted(torch.stack(parts, 1)))
 

@@ -30,8 +30,8 @@ MAX_NODES = 1_000_000  # of the trees that are searched at once; more problems a
 GROUP_BYTES = 10**9  # of these trees
 
 
-#: Surface, table of the items in the bin, pile, and table of the items that are seen to come, of one problem.
-_Tote: TypeAlias = tuple[Tensor, Tensor, Pile | None, Tensor | None]
+#: Surface, table of the items in the bin, pile, table of the items that are seen to come, and boxes, of one problem.
+_Tote: TypeAlias = tuple[Tensor, Tensor, Pile | None, Tensor | None, Tensor | None]
 
 
 @dataclass(eq=False)
@@ -44,10 +44,11 @@ class _Node:
     edges: dict[int, "_Edge"] = field(default_factory=dict)
     pile: Pile | None = None  # of the items in the tote, see State
     coming: Tensor | None = None  # int64 [p, 9], a table of those that arrive next, see State
+    boxes: Tensor | None = None  # int64 [L, 6], of the items in the tote, see State
 
     @property
     def tote(self) -> _Tote:
-        return self.surface, self.items, self.pile, self.coming
+        return self.surface, self.items, self.pile, self.coming, self.boxes
 
 
 @dataclass(eq=False)
@@ -102,11 +103,8 @@ class MCTS(MapPlanner):
     ):
         self.cell, self.items, self.mask = cell, search_items(items), flag("planner.mask", mask)
         self.simulations = whole_number("planner.simulations", simulations, most=MAX_NODES)
-        pile_bytes = cell.records_pile * cell.pile_room**2  # mostly the table of the items below one another
-        self.node_bytes = 1_000 + pile_bytes
-        check_bytes(
-            f"planner.simulations={simulations} with piles", self.simulations * bool(pile_bytes) * self.node_bytes
-        )
+        self.node_bytes = 1_000 + cell.handling * cell.room**2  # mostly the table of the items below one another
+        check_bytes(f"planner.simulations={simulations} with loads", self.simulations * cell.handling * self.node_bytes)
         self.batch_simulations = whole_number("planner.batch_simulations", batch_simulations, most=4_096)
         self.exploration = number("planner.exploration", exploration, most=1e6)
         self.widening = number("planner.widening", widening, most=1)
@@ -217,9 +215,8 @@ class MCTS(MapPlanner):
         if self.mask:
             return *put_down(self.cell, state, action), torch.ones_like(action, dtype=torch.bool)
         step = apply(self.cell, state, action)
-        after = state._replace(
-            surface=step.surface, items=remove_item(self.cell, state.items, step.taken), pile=step.pile
-        )
+        items = remove_item(self.cell, state.items, step.taken)
+        after = state._replace(surface=step.surface, items=items, pile=step.pile, boxes=step.boxes)
         return after, step.item, step.failure == 0
 
     def _nodes(self, state: State, mask: Tensor | None = None) -> list[_Node]:
@@ -234,7 +231,10 @@ class MCTS(MapPlanner):
             rows = zip(number.numpy(), mask.numpy(), strict=True)
             untried = [self._random.permutation(row[good]).tolist() for row, good in rows]
         totes = zip(_unstack(state), untried, strict=True)
-        return [_Node(*tote[:2], actions, pile=tote[2], coming=tote[3]) for tote, actions in totes]
+        return [
+            _Node(surface, items, actions, {}, pile, coming, boxes)
+            for (surface, items, pile, coming, boxes), actions in totes
+        ]
 
     def _arrive(self, state: State) -> tuple[State, Tensor]:
         """Return the states after items have arrived, and a mask of those in which all items were seen, bool ``[M]``.
@@ -277,13 +277,15 @@ def _unstack(state: State) -> list[_Tote]:
     count = len(state.surface)
     piles = [None] * count if state.pile is None else [state.pile.rows(row) for row in range(count)]
     coming = [None] * count if state.coming is None else state.coming.table
-    return [*zip(state.surface, state.items.table, piles, coming, strict=True)]
+    boxes = [None] * count if state.boxes is None else state.boxes
+    return [*zip(state.surface, state.items.table, piles, coming, boxes, strict=True)]
 
 
 def _stack(parts: Sequence[_Tote], problems: State) -> State:
     """Return the states of problems with other totes and bins: the inverse of :func:`_unstack`."""
-    surface, items, piles, tables = zip(*parts, strict=True)
+    surface, items, piles, tables, placed = zip(*parts, strict=True)
     pile = None if piles[0] is None else Pile(*map(torch.stack, zip(*piles, strict=True)))
     coming = None if tables[0] is None else Item.from_table(torch.stack(tables))
+    boxes = None if placed[0] is None else torch.stack(placed)
     bins = Item.from_table(torch.stack(items))
-    return problems._replace(surface=torch.stack(surface), items=bins, pile=pile, coming=coming)
+    return problems._replace(surface=torch.stack(surface), items=bins, pile=pile, coming=coming, boxes=boxes)

@@ -180,7 +180,7 @@ def admit_coming_items(cell: CellSpec, state: State) -> tuple[State, Tensor]:
     In an empty bin an item lies at its own place, as in the environment. In any other bin it lies at the first free
     place; the environment draws one at random.
     """
-    _, _, items, settings, _, coming = state
+    items, settings, coming = state.items, state.episode, state.coming
     awaits = may_arrive(cell, items, settings)  # asked once: the items of a batch arrive together
     if coming is None:
         return state, awaits & is_below_limit(items, settings)

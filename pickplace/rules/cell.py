@@ -63,7 +63,7 @@ class CellSpec:
         longest_side: longest side of any item, if known; no item may be longer. It saves time. Unless the gripper
             limits the size of items, it also sets the number of offsets.
         most_items: greatest number of items in a tote, if known; else there is room for one in each cell and height
-            unit. Used only if the pile is recorded.
+            unit. Used only with ``handling``, or if the stability rule looks at the boxes in the tote.
         varies: settings in which episodes may differ, besides the height of the tote: names of
             :data:`~pickplace.rules.observation.EPISODE_TERMS`. The observation has an entry for each.
         item_inset: cells at each edge of the item, along x and y, that a measured item may cover only in part; see
@@ -182,13 +182,8 @@ class CellSpec:
         return self.handling or "rotations" in self.varies
 
     @property
-    def records_pile(self) -> bool:
-        """Whether a state has the :class:`~pickplace.rules.pile.Pile` in the tote: for loads, or the stability rule."""
-        return self.handling or self.support.sees_boxes
-
-    @property
-    def pile_room(self) -> int:
-        """``L``, the number of items that a tote has room for, see :class:`~pickplace.rules.pile.Pile`."""
+    def room(self) -> int:
+        """``L``, the number of items that a tote has room for."""
         return self.most_items or self.tote_volume(self.tote_size[2])
 
     @cached_property

@@ -123,7 +123,7 @@ def placing_maps(
     """
     surface, tote_height, item = state.each_item()
     effector = effector_over_tote(cell, state.surface, state.tote_height)
-    boxes = state.boxes if cell.support.sees_boxes else None
+    boxes = None if state.boxes is None else state.boxes.repeat_interleave(state.items.x.shape[1], 0)
     top, rest = find_top(cell, surface, tote_height, item, state.capacity, boxes)
     maps = PlacingMaps.of(top, rest, effector, item, blocked_picks(cell, state.items))
     return maps.within_turns(cell) if cell.forbids_turns else maps

@@ -14,7 +14,7 @@ from torch import Tensor
 from pickplace.common.validate import expect, number, refuse_if, short_text
 from pickplace.rules.cell import CellSpec
 from pickplace.rules.item import NO_LIMIT, Item, bin_depth_from_items, bin_labels_from_items, flags_from_turns
-from pickplace.rules.state import PILE_KEYS, State
+from pickplace.rules.state import State
 
 PAPER_CELL = CellSpec()
 MAX_NUMBER = 2**31 - 1  # greatest value of an :class:`EpisodeNumber`
@@ -124,26 +124,36 @@ class Handling(Term):
 
 
 class PilePart(Term):
-    """A part of the :class:`~pickplace.rules.pile.Pile` of the items in the tote, in cells that record it.
+    """A part of the :class:`~pickplace.rules.pile.Pile` of the items in the tote, in cells with ``handling``.
 
     Args:
-        key: name of the part: ``"labels"``, ``"spare"``, ``"below"`` or ``"boxes"``.
+        key: name of the part: ``"labels"``, ``"spare"`` or ``"below"``.
     """
 
     def __init__(self, key: str):
         self.key = key
 
     def bounds(self, cell, tallest):
-        room = cell.pile_room
+        room = cell.room
         return {
             "labels": Bounds(0, room, cell.tote_size[:2], torch.int64),
             "spare": Bounds(0, NO_LIMIT, (room,), torch.int64),
             "below": Bounds(0, 1, (room, room), torch.bool),
-            "boxes": Bounds(0, max(cell.tote_size), (room, 6), torch.int64),
         }[self.key]
 
     def value(self, cell, state):
         return getattr(state.pile, self.key).clone()
+
+
+class ToteBoxes(Term):
+    """The items in the tote, int64 ``[N, L, 6]``, see :class:`~pickplace.rules.state.State`, in cells whose stability
+    rule looks at them."""
+
+    def bounds(self, cell, tallest):
+        return Bounds(0, max(cell.tote_size), (cell.room, 6), torch.int64)
+
+    def value(self, cell, state):
+        return state.boxes.clone()
 
 
 class ToteCapacity(Term):
@@ -162,7 +172,7 @@ class ToteCapacity(Term):
         return Bounds(-1e-3, self.most, cell.tote_size[:2])
 
     def value(self, cell, state):
-        refuse_if(not cell.handling, "tote_capacity: there are no loads; expected env.handling=true.")
+        refuse_if(state.pile is None, "tote_capacity: there are no loads; expected env.handling=true.")
         return (state.pile.capacity / 1000).clamp(max=self.most).float()
 
 
@@ -237,13 +247,18 @@ STANDARD_TERMS: Mapping[str, Term] = {
     "tote_height": ToteHeight(),
 }
 
-#: Further entries of every observation in cells that record the pile, and in cells with ``handling``.
-PILE_TERMS: Mapping[str, Term] = {key: PilePart(key.partition("_")[2]) for key in PILE_KEYS}
-HANDLING_TERMS: Mapping[str, Term] = {"handling": Handling(), **PILE_TERMS}
+#: Further entries of every observation in cells with ``handling``.
+HANDLING_TERMS: Mapping[str, Term] = {
+    "handling": Handling(),
+    "tote_labels": PilePart("labels"),
+    "pile_spare": PilePart("spare"),
+    "pile_below": PilePart("below"),
+}
 
 #: Entries that only some cells have. From their presence the rules know the cell.
 OPTIONAL_TERMS: Mapping[str, Term] = {
-    "bin_labels": BinLabels(), "items": Items(), "coming": Coming(), **HANDLING_TERMS, **EPISODE_TERMS,
+    "bin_labels": BinLabels(), "items": Items(), "coming": Coming(), "tote_boxes": ToteBoxes(), **HANDLING_TERMS,
+    **EPISODE_TERMS,
 }  # fmt: skip
 
 #: Keys of the environment, the policies and the learner that no term may have.
@@ -259,8 +274,10 @@ def standard_terms(cell: CellSpec) -> dict[str, Term]:
     """Return the terms that an observation of a cell always has."""
     several: dict[str, Term] = {"bin_labels": BinLabels(), "items": Items()} if cell.bin_items > 1 else {}
     coming = {"coming": Coming()} if cell.preview else {}
-    pile = HANDLING_TERMS if cell.handling else PILE_TERMS if cell.records_pile else {}
-    return {**STANDARD_TERMS, **several, **coming, **pile, **{key: EPISODE_TERMS[key] for key in cell.varies}}
+    handling = HANDLING_TERMS if cell.handling else {}
+    boxes = {"tote_boxes": ToteBoxes()} if cell.support.sees_boxes else {}
+    varied = {key: EPISODE_TERMS[key] for key in cell.varies}
+    return {**STANDARD_TERMS, **several, **coming, **handling, **boxes, **varied}
 
 
 def item_keys(bin_items: int) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Piles: the items of a tote, which of them lie on which, and what each may still bear.
+"""Piles: which items of a tote lie on which, and what each of them may still bear.
 
 An item rests on the items that it touches from above: the top items of the cells under it that are as high as its
 underside. The *pile below* it are these items and all that they rest on, down to the floor. The full mass of an item
@@ -23,18 +23,12 @@ class Pile(NamedTuple):
     labels: Tensor  # int64 [N, W_T, D_T]: number of the item on top of each cell; 0: the floor
     spare: Tensor  # int64 [N, L]: mass that each item may still bear, grams; 0 where there is no item
     below: Tensor  # bool [N, L, L]: [n, i, j]: item j is in the pile below item i, or is item i
-    boxes: Tensor  # int64 [N, L, 6]: minimum corner x, y, z and sides w, d, h of each item; 0 where there is none
 
     @classmethod
     def empty(cls, batch: int, grid: Sequence[int], room: int, device=None) -> "Pile":
         """Return the piles of empty totes with a grid ``(W_T, D_T)`` and room for ``room`` items."""
         labels = torch.zeros(batch, *grid[:2], dtype=torch.int64, device=device)
-        return cls(
-            labels,
-            labels.new_zeros(batch, room),
-            labels.new_zeros(batch, room, room, dtype=torch.bool),
-            labels.new_zeros(batch, room, 6),
-        )
+        return cls(labels, labels.new_zeros(batch, room), labels.new_zeros(batch, room, room, dtype=torch.bool))
 
     def rows(self, index) -> "Pile":
         """Return the piles of some problems, by their numbers, which may repeat."""
@@ -61,7 +55,7 @@ class Pile(NamedTuple):
         capacity = torch.cat([floor, each], 1).gather(1, labels).view_as(self.labels)
         return torch.where((self.num_items == self.spare.shape[1])[:, None, None], -1, capacity)
 
-    def add(self, item: Item, index: Tensor, touched: Tensor, inside: Tensor, box: Tensor) -> "Pile":
+    def add(self, item: Item, index: Tensor, touched: Tensor, inside: Tensor) -> "Pile":
         """Return the piles with another item on top of each.
 
         Args:
@@ -69,7 +63,6 @@ class Pile(NamedTuple):
             index: int64 ``[S * S, N]``, flat cells of the tote, some of which the item rests on.
             touched: bool ``[S * S, N]``, whether the item rests on each of them.
             inside: bool ``[N, W_T, D_T]``, the cells that the item covers; none if no item is added.
-            box: int64 ``[N, 6]``, see :attr:`boxes`.
         """
         number, added = self.num_items[:, None], inside.flatten(1).any(1)[:, None]
         own = (torch.arange(self.spare.shape[1], device=number.device) == number) & added  # [N, L]
@@ -79,5 +72,4 @@ class Pile(NamedTuple):
         loaded = beneath & added & (self.spare < NO_LIMIT)
         spare = torch.where(own, item.max_load[:, None], self.spare - loaded * item.grams[:, None])
         below = torch.where(own[:, :, None], (beneath | own)[:, None], self.below)
-        boxes = torch.where(own[:, :, None], box[:, None], self.boxes)
-        return Pile(torch.where(inside, number[..., None] + 1, self.labels), spare, below, boxes)
+        return Pile(torch.where(inside, number[..., None] + 1, self.labels), spare, below)

@@ -30,8 +30,8 @@ def resting_top(
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Return the height of the item's top on every footprint, and of its underside, int32 ``[N, Q, W_T, D_T]`` each.
 
-    Arguments: see :meth:`~pickplace.rules.state.State.each_item`, :attr:`~pickplace.rules.state.State.capacity` and
-    :attr:`~pickplace.rules.state.State.boxes`.
+    Arguments: see :meth:`~pickplace.rules.state.State.each_item` and :attr:`~pickplace.rules.state.State.capacity`.
+    ``boxes`` are those in the tote, int64 ``[N, L, 6]``, for rules with ``sees_boxes``.
 
     The top is ``NEVER`` where the item cannot rest: the footprint leaves the tote, the top passes the rim, the support
     is too small, or something below would be overloaded. The underside is given whether the item is stable or not, and

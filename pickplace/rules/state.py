@@ -76,8 +76,6 @@ class EpisodeSettings(NamedTuple):
         return EpisodeSettings(*(part if part is None else part[index] for part in self))
 
 
-#: Keys of an observation's entries for the parts of a pile.
-PILE_KEYS = ("tote_labels", "pile_spare", "pile_below", "pile_boxes")
 FULL_TASK = EpisodeSettings()
 
 
@@ -88,8 +86,10 @@ class State(NamedTuple):
     tote_height: Tensor  # int64 [N]: height of the episode's tote, H_T
     items: Item  # in the bin, [N, M]
     episode: EpisodeSettings = FULL_TASK  # settings in which the running episodes may differ
-    pile: Pile | None = None  # the items in the tote; None: they are not recorded, and any item bears any load
+    pile: Pile | None = None  # the items in the tote; None: any item bears any load
     coming: Item | None = None  # items that arrive next, in their order, [N, p]; None: none are seen
+    boxes: Tensor | None = None  # int64 [N, L, 6]: corner x, y, z and sides w, d, h of the items in the tote, in the
+    # order in which they were put down, then zeros; None: they are not recorded
 
     @classmethod
     def from_observation(cls, observation: Observation) -> "State":
@@ -99,9 +99,9 @@ class State(NamedTuple):
         surface, items = surface_from(heights, observation["tote_bearing"]), items_from_observation(observation)
         pile = None
         if "pile_below" in observation:
-            pile = Pile(*(observation[key] for key in PILE_KEYS))
-        coming = coming_from_observation(observation)
-        return cls(surface, tote_height, items, EpisodeSettings.from_observation(observation), pile, coming)
+            pile = Pile(*(observation[key] for key in ("tote_labels", "pile_spare", "pile_below")))
+        coming, boxes = coming_from_observation(observation), observation.get("tote_boxes", None)
+        return cls(surface, tote_height, items, EpisodeSettings.from_observation(observation), pile, coming, boxes)
 
     @property
     def heights(self) -> Tensor:
@@ -117,7 +117,8 @@ class State(NamedTuple):
         """Return the state of some problems, by their numbers, which may repeat."""
         parts = self.surface[index], self.tote_height[index], self.items.rows(index), self.episode.rows(index)
         pile = None if self.pile is None else self.pile.rows(index)
-        return State(*parts, pile, None if self.coming is None else self.coming.rows(index))
+        coming = None if self.coming is None else self.coming.rows(index)
+        return State(*parts, pile, coming, None if self.boxes is None else self.boxes[index])
 
     def each_item(self) -> tuple[Tensor, Tensor, Item]:
         """Return one problem for each item; the items of a bin follow one another.
@@ -135,12 +136,6 @@ class State(NamedTuple):
         """The greatest mass that each cell of the tote bears, int64 ``[N * M, W_T, D_T]``, one map for each item of
         :meth:`each_item`; None: any mass."""
         return None if self.pile is None else self.pile.capacity.repeat_interleave(self.items.x.shape[1], 0)
-
-    @property
-    def boxes(self) -> Tensor | None:
-        """The items in the tote, int64 ``[N * M, L, 6]``, one table for each item of :meth:`each_item`, see
-        :class:`~pickplace.rules.pile.Pile`; None: they are not recorded."""
-        return None if self.pile is None else self.pile.boxes.repeat_interleave(self.items.x.shape[1], 0)
 
     def repeat(self, count: int) -> "State":
         """Return each problem ``count`` times, one copy after the other."""

@@ -34,6 +34,7 @@ class Step(NamedTuple):
     item: Item  # the item that is taken, [N]
     taken: Tensor  # int64 [N]: its number in the bin
     pile: Pile | None  # the items in the tote, see State
+    boxes: Tensor | None
 
 
 def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
@@ -42,7 +43,7 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     Args:
         action: int64 ``[N]``, the flat index, in ``[0, N_a)``.
     """
-    (surface, tote_height, items, _, pile, _), (tote_w, tote_d, _), (ee_w, ee_d) = (
+    (surface, tote_height, items, _, pile, _, boxes), (tote_w, tote_d, _), (ee_w, ee_d) = (
         state,
         cell.tote_size,
         cell.gripper.size,
@@ -50,7 +51,7 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     taken, item, blocked = take_item(cell, items, action)
     picked, rotation, (left, front, wide, deep), (x, y, w, d) = carry(cell, item, action, blocked)
     # Cells outside the tote do not matter: an item there fails, and some cell of the end effector is always inside.
-    contact, index = _contact(cell, surface, x, y, w, d, None if pile is None else Neighbours(pile.boxes, x, y, item.h))
+    contact, index = _contact(cell, surface, x, y, w, d, None if boxes is None else Neighbours(boxes, x, y, item.h))
     top, reach = contact.z.long() + item.h, max(ee_w, ee_d)
     covered = body_cells(cell.effectors, reach, action.device)  # [reach * reach, B]
     if len(cell.effectors) > 1:
@@ -70,7 +71,8 @@ def apply(cell: CellSpec, state: State, action: Tensor) -> Step:
     failure = first_failure(picked, resting, effector, turn)
     height = torch.where(failure == 0, item.h, 0)
     after, pile = _add_item(cell, surface, pile, item, x, y, contact, index, height)
-    return Step(after, failure, top, torch.stack([x, y, w, d], -1), item, taken, pile)
+    boxes = _add_box(boxes, x, y, contact, height)
+    return Step(after, failure, top, torch.stack([x, y, w, d], -1), item, taken, pile, boxes)
 
 
 @lru_cache(maxsize=64)
@@ -100,7 +102,8 @@ def put_down(cell: CellSpec, state: State, choice: Tensor) -> tuple[State, Item]
     w, d = turned_size(item, quarter_turned == 1)
     on = _contact(cell, state.surface, x, y, w, d)
     surface, pile = _add_item(cell, state.surface, state.pile, item, x, y, *on, item.h)
-    return state._replace(surface=surface, items=remove_item(cell, state.items, taken), pile=pile), item
+    items, boxes = remove_item(cell, state.items, taken), _add_box(state.boxes, x, y, on[0], item.h)
+    return state._replace(surface=surface, items=items, pile=pile, boxes=boxes), item
 
 
 def _contact(
@@ -154,6 +157,14 @@ def _add_item(
         weak = contact.under & added & ~cell.support.bearing(contact)
         after.scatter_add_(0, index, -weak.int())
     if pile is not None:
-        box = torch.stack([x, y, contact.z.long(), contact.w, contact.d, height], -1)
-        pile = pile.add(item, index, _touched(contact), inside.permute(2, 0, 1), box)
+        pile = pile.add(item, index, _touched(contact), inside.permute(2, 0, 1))
     return after.t().unflatten(1, grid).contiguous(), pile
+
+
+def _add_box(boxes: Tensor | None, x: Tensor, y: Tensor, contact: Contact, height: Tensor) -> Tensor | None:
+    """Return the boxes in the totes after an item is added; for the arguments see :func:`_add_item`."""
+    if boxes is None:
+        return None
+    box = torch.stack([x, y, contact.z.long(), contact.w, contact.d, height], -1)
+    number = torch.arange(boxes.shape[1], device=boxes.device) == (boxes[..., 5] > 0).sum(1, keepdim=True)
+    return torch.where((number & (height > 0)[:, None])[..., None], box[:, None], boxes)

@@ -408,8 +408,8 @@ def test_there_is_room_for_the_items_that_fit_a_container_only():
     items = [OrderItem("a", 100.0, 100.0, 62.1, 9, "line 1", max_load=10**6)] * 1000
     packer = OrderPacker((200, 100, 312), 20)
     cell, (first, *others) = packer.pack(items[:25])
-    assert cell.pile_room == 10 and [len(each.items) for each in (first, *others)] == [10, 10, 5]
-    assert packer._cell_for(items).pile_room == 10
+    assert cell.room == 10 and [len(each.items) for each in (first, *others)] == [10, 10, 5]
+    assert packer._cell_for(items).room == 10
 
 
 def test_an_order_is_checked_for_a_cell_that_is_too_fine():

@@ -414,7 +414,7 @@ def test_limits_are_obeyed(tmp_path):
         PickPlaceEnv(items, **settings)
     env = PickPlaceEnv(items, **settings, handling=True)
     seen = env.reset()
-    assert env.cell.pile_room == 2 and seen["handling"].tolist() == [[[5, 1000, 0]]]
+    assert env.cell.room == 2 and seen["handling"].tolist() == [[[5, 1000, 0]]]
     feasible = seen["action_mask"][0].nonzero()[:, 0]
     assert len(feasible) and not (feasible % 2).any()  # never turned by a quarter
     for failures in ({Failure.NONE}, {Failure.NONE, Failure.OVERLOADED}):

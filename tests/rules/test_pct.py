@@ -10,12 +10,15 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from pickplace import PickPlaceEnv, State
+from pickplace.envs.saved_state import check_saved_states
 from pickplace.items.distributions import Uniform
+from pickplace.planners.mcts import MCTS
 from pickplace.robot.planner import Planner
 from pickplace.rules.gripper.rules import Contain
 from pickplace.rules.masks import action_mask, placing_maps
 from pickplace.rules.step import apply
 from pickplace.rules.support.pct import _Pile
+from pickplace.runs.locate import CheckpointError
 
 GRID = 8
 
@@ -146,7 +149,7 @@ def test_masks_are_what_a_step_accepts(env):
     observation, refused = env.reset(), 0
     for _ in range(5):
         state = State.from_observation(observation)
-        assert state.pile.boxes.equal(env.state.pile.boxes)
+        assert state.boxes.equal(env.state.boxes)
         mask = action_mask(env.cell, placing_maps(env.cell, state))
         assert mask.equal(observation["action_mask"])
         count = env.cell.num_actions
@@ -167,11 +170,11 @@ def test_boxes_of_an_episode(env):
         step = apply(env.cell, state, observation["action_mask"].int().argmax(1))
         x, y, w, d = step.footprint.unbind(1)
         observation = env.step(observation.set("action", observation["action_mask"].int().argmax(1)))["next"]
-        box = env.state.pile.boxes[:, number]
+        box = env.state.boxes[:, number]
         assert box.equal(torch.stack([x, y, step.top - step.item.h, w, d, step.item.h], 1))
-        assert not env.state.pile.boxes[:, number + 1 :].any()
+        assert not env.state.boxes[:, number + 1 :].any()
     env.reset()
-    assert not env.state.pile.boxes.any()
+    assert not env.state.boxes.any()
 
 
 def test_a_robot_s_images_do_not_show_the_boxes(env):
@@ -180,5 +183,40 @@ def test_a_robot_s_images_do_not_show_the_boxes(env):
 
 
 def test_a_state_without_a_pile(env):
-    with pytest.raises(ValueError, match="^The state has no pile"):
-        placing_maps(env.cell, env.state._replace(pile=None))
+    with pytest.raises(ValueError, match="^The state has no boxes"):
+        placing_maps(env.cell, env.state._replace(boxes=None))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda boxes: boxes[0, 1, 5].add_(1),  # higher than the surface
+        lambda boxes: boxes[0, 0, 3].fill_(0),
+        lambda boxes: boxes[0, 0, 0].fill_(-1),
+        lambda boxes: boxes[0, 0, 4].fill_(6),  # leaves the tote
+        lambda boxes: boxes[0, -1].fill_(1),
+        lambda boxes: boxes.zero_(),
+    ],
+)
+def test_boxes_that_no_episode_leads_to_are_refused(env, change):
+    carried = env.reset()
+    for _ in range(2):
+        action = carried["action_mask"].int().argmax(1)
+        _, carried = env.step_and_maybe_reset(carried.set("action", action))
+    saved = {"environment": {key: value.clone() for key, value in env.state_dict().items()}, "carried": carried}
+    check_saved_states(env, saved)
+    change(saved["environment"]["boxes"])
+    with pytest.raises(CheckpointError, match="of no use: boxes"):
+        check_saved_states(env, saved)
+
+
+@pytest.mark.parametrize("mask", [True, False])
+def test_a_search_keeps_the_boxes(env, mask):
+    """Its plans hold in the environment, whose own boxes grow in the same way."""
+    planner, observation = MCTS(env.cell, env.items, simulations=40, mask=mask), env.reset()
+    for _ in range(4):
+        state = State.from_observation(observation)
+        action = planner.choose(env.cell, state, placing_maps(env.cell, state), observation)
+        step = env.step(observation.set("action", action))["next"]
+        observation = env.reset(step.set("_reset", step["done"])) if step["done"].any() else step
+        assert mask <= bool((step["failure"] != 6).all())

@@ -172,18 +172,12 @@ def test_a_pile_that_no_episode_leads_to_is_refused(change, words):
         lambda pile: pile.spare[0, 0].fill_(-1),
         lambda pile: pile.labels[0, 1, 0].fill_(4),
         lambda pile: pile.labels[0, 1, 0].fill_(3),  # on two heights
-        lambda pile: pile.boxes[0, 1, 2].fill_(-1),
-        lambda pile: pile.boxes[0, 1, 4].fill_(0),
-        lambda pile: pile.boxes[0, 1, 3].fill_(3),  # leaves the tote
-        lambda pile: pile.boxes[0, 2, 5].fill_(2),  # higher than the surface
-        lambda pile: pile.boxes[0, 3, 3:].fill_(1),
     ],
 )
 def test_impossible_piles_by_hand(change):
     """The lowest item of a tower of three takes two cells; there is room for a fourth."""
     below = torch.tensor([[[1, 0, 0, 0], [1, 1, 0, 0], [1, 1, 1, 0], [0, 0, 0, 0]]]).bool()
-    boxes = torch.tensor([[[0, 0, 0, 2, 1, 1], [0, 0, 1, 1, 1, 1], [0, 0, 2, 1, 1, 1], [0] * 6]])
-    pile = Pile(torch.tensor([[[3], [1]]]), torch.tensor([[0, 5, NO_LIMIT, 0]]), below, boxes)
+    pile = Pile(torch.tensor([[[3], [1]]]), torch.tensor([[0, 5, NO_LIMIT, 0]]), below)
     steps, heights = torch.tensor([3]), torch.tensor([[[3], [1]]], dtype=torch.int32)
     assert _is_possible(pile, steps, heights).tolist() == [True]
     change(pile)

@@ -52,7 +52,7 @@ class Contact:
     def neighbours(self) -> Neighbours:
         """What else is in the tote; raise ``ValueError`` if it is not known."""
         if self.recorded is None:
-            raise ValueError("The state has no pile, but the stability rule looks at it: expected State.pile.")
+            raise ValueError("The state has no boxes, but the stability rule looks at them: expected State.boxes.")
         return self.recorded
 
     def cells(self) -> Iterator[Tensor]:

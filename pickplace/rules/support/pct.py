@@ -9,6 +9,8 @@ from typing import NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
+from pickplace.common.capture import is_capturing
+from pickplace.common.validate import refuse_if
 from pickplace.rules.support.base import Support
 from pickplace.rules.support.contact import Contact
 
@@ -35,6 +37,7 @@ class Pct(Support):
     sees_boxes = True
 
     def stable(self, contact: Contact) -> Tensor:
+        refuse_if(is_capturing(), "compile.cudagraphs=true: support=pct works in Python; expected false.")
         boxes, x, y, h = contact.neighbours
         parts = (part.expand(contact.z.shape) for part in (x, y, contact.z, contact.w, contact.d, h))
         cuboids = torch.stack([*parts], -1).view(-1, len(boxes), 6).transpose(0, 1).tolist()
