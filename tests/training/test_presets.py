@@ -32,14 +32,20 @@ def test_every_preset_runs(name, tmp_path, monkeypatch):
         "mixed": [7, 7, 3],
         "buffer": [7, 7, 5],
         "warehouse": [16, 12, 60],
+        "orders": [40, 35, 200],
     }
     extra = [f"env.tote_size={sizes[name]}".replace(" ", "")] if name in sizes else []
     extra += ["items.depth=[9,10]"] * (name == "warehouse")  # fewer kinds
     extra += ["warm_start.weights=null"] * (name == "buffer")  # of another size than these networks
     extra += ["device=cpu"] * name.endswith("_gpu")
+    if name == "orders":
+        lines = (f"{order},{300 + 20 * order},200,300,1" for order in range(4) for _ in range(2))
+        (orders := tmp_path / "orders.csv").write_text("\n".join(("order,length,width,height,weight", *lines)))
+        extra += [f"items.path={orders}", "evaluation.episodes=1"]
     tiny = TINY if composed(f"experiment={name}")["model"]["critic"] else ONE_NETWORK
     assert 0 <= train(composed(f"experiment={name}", *tiny, *extra), tmp_path) <= 1
     assert [row["frames"] for row in read_csv(tmp_path / "metrics.csv")] == [16]
+    (tmp_path / "orders.csv").unlink(missing_ok=True)
     files = {".lock", "checkpoints", "learning_curve.png", "metrics.csv", "report.html"}
     assert {path.name for path in tmp_path.iterdir()} - {"learning_curve.pdf", "learning_curve.svg"} == files
 
