@@ -1,9 +1,8 @@
 """Pack grocery orders of BED-BPP by rules and by learned values: python benchmarks/orders.py bed-bpp_v1.json
 
-Takes from your copy of BED-BPP the orders that bed_bpp_orders.json names: those to train on, written to
-outputs/orders/train.json for ``experiment=orders``, and those to test on. Plays the latter in both containers, with each
-pile in the physics engine, and adds rows to docs/results/orders.csv. What is there is not played again; to repeat a row,
-delete it.
+Takes the orders that bed_bpp_orders.json names from your copy of BED-BPP: outputs/orders/train.json, for
+``experiment=orders``, and test.json. Plays the latter in both containers, with each pile in the physics engine. Adds
+rows to docs/results/orders.csv; what is there is not played again. To repeat a row, delete it.
 """
 
 import json
