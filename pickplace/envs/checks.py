@@ -25,7 +25,7 @@ def problem_bytes(cell: CellSpec, masks: Collection[str]) -> int:
     """Return about the number of bytes of one problem's masks and of the tensors from which they are computed."""
     offsets = cell.num_offsets**2
     count = 64 * cell.num_footprints + 32 * cell.rotations * (offsets + cell.num_picks)
-    count += cell.handling * (16 * cell.num_footprints + 10 * cell.room**2) + cell.support.sees_boxes * 200 * cell.room
+    count += cell.handling * 16 * cell.num_footprints + 10 * cell.record_bytes
     return cell.bin_items * (count + ("action" in masks) * (4 * cell.num_actions + 8 * offsets * cell.num_places))
 
 
@@ -139,7 +139,7 @@ def check_items(cell: CellSpec, items: ItemDistribution, mix: int = 0, turns: in
     for chunk in rows[list(distinct.values())].split(max(1, min(1024, 2**24 // cell.num_footprints))):
         empty = torch.full((len(chunk), *cell.tote_size[:2]), EMPTY, dtype=torch.int32)
         item = Item.from_table(chunk[:, None, :5])._replace(turns=chunk[:, None, 5])
-        boxes = empty.new_zeros(len(chunk), 0, 6, dtype=torch.int64) if cell.support.sees_boxes else None
+        boxes = empty.new_zeros(len(chunk), 1, 6, dtype=torch.int64) if cell.support.sees_boxes else None
         maps = placing_maps(cell, State(empty, torch.full((len(chunk),), height), item, boxes=boxes))
         feasible = footprint_mask(cell, maps).flatten(1).any(1)
         if not feasible.all():

@@ -52,6 +52,7 @@ class PickPlaceGymEnv(gymnasium.Env):
 
     with `preview=p` `coming`, `(p, 5)` int64: x, y, w, d, h of the items that arrive next, in their order; zeros: none;
     with `handling=True` the items' `handling`, and the pile in the tote: `tote_labels`, `pile_spare` and `pile_below`;
+    with `support=pct` `tote_boxes`, `(L, 6)` int64: x, y, z, w, d, h of the items in the tote;
     and the terms of `observation=` (see `PickPlaceEnv`).
 
     ## Rewards

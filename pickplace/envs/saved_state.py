@@ -106,8 +106,10 @@ def _are_possible(boxes: Tensor, steps: Tensor, heights: Tensor) -> Tensor:
     x, y, z, w, d, h = boxes.unbind(2)
     good = ((boxes[..., 3:] > 0).all(2) == there) & (boxes >= 0).all(2) & (there | (boxes == 0).all(2))
     good &= (x + w <= heights.shape[1]) & (y + d <= heights.shape[2])
-    covered = rectangle(heights.shape[1:], *(part.flatten() for part in (x, y, w, d)))  # [W_T, D_T, N * L]
-    tops = (covered * (z + h).flatten()).unflatten(2, boxes.shape[:2]).amax(3).permute(2, 0, 1)
+    tops = torch.zeros_like(heights)
+    for box in range(int(steps.max())):  # one at a time, for the memory
+        covered = rectangle(heights.shape[1:], *(part[:, box] for part in (x, y, w, d))).permute(2, 0, 1)
+        tops = torch.maximum(tops, covered * (z + h)[:, box, None, None].to(tops.dtype))
     return good.all(1) & (tops == heights).flatten(1).all(1)
 
 

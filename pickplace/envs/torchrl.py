@@ -52,6 +52,7 @@ class PickPlaceEnv(EnvBase):
           ``tote_labels``, int64 ``[N, W_T, D_T]``, number of the item on each cell, from 1, 0 for the floor;
           ``pile_spare``, int64 ``[N, L]``, the mass that each still bears; ``pile_below``, bool ``[N, L, L]``, whether
           the second item lies below the first, or is the same.
+        * with ``support=pct``: ``tote_boxes``, int64 ``[N, L, 6]``: x, y, z, w, d, h of the items in the tote.
         * with ``varies``: ``rotations``, bool ``[N, R]``; int64 ``[N, 1]``: ``item_mix``, ``bin_items``, ``refill``,
           ``preview`` and ``level``.
         * further terms, see ``observation``.
@@ -140,7 +141,7 @@ class PickPlaceEnv(EnvBase):
         self.cell = replace(cell, longest_side=longest_side(cell, items))
         device = usable_device(device)
         words = f"num_envs={num_envs}"
-        words += f" with handling=true and room for {cell.room:,} items in a tote" if cell.handling else ""
+        words += f" with room for {cell.room:,} items in a tote, which are recorded" if cell.record_bytes else ""
         check_bytes(words, num_envs * problem_bytes(self.cell, masks), device)
         super().__init__(device=device, batch_size=[num_envs])
         self.stream, self.masks = stream, tuple(masks)

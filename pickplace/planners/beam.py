@@ -105,7 +105,7 @@ class Beam(MapPlanner):
             mask: the choices by which each plan may be extended, at least one in all, bool ``[P, choices]``.
         """
         row, choice = mask.nonzero(as_tuple=True)
-        at_once = max(1, CELLS_AT_ONCE // (plans.state.surface[0].numel() + self.cell.handling * self.cell.room**2))
+        at_once = max(1, CELLS_AT_ONCE // (plans.state.surface[0].numel() + self.cell.record_bytes))
         parts = [self._judge(plans, *some) for some in zip(row.split(at_once), choice.split(at_once), strict=True)]
         placed, total, outcome = map(torch.cat, zip(*parts, strict=True))
         different = _first_of_each(outcome)
@@ -155,8 +155,8 @@ def _first_of_each(value: Tensor) -> Tensor:
 
 def _fingerprint(problem: Tensor, state: State) -> Tensor:
     """Return a hash of each of ``P`` states, int64 ``[P]``. It is equal for equal problems, totes, loads that they can
-    still bear, boxes in them if they are recorded, sets of items in the bin, and items to come. Other pairs of states
-    are equal with probability 2**-64."""
+    still bear, boxes in them in their order if they are recorded, sets of items in the bin, and items to come. Other
+    pairs of states are equal with probability 2**-64."""
     table = state.items.table
     each = _mixed(_weighted(table)) * state.items.exists
     maps = [state.surface] if state.pile is None else [state.surface, state.pile.capacity]

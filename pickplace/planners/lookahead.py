@@ -83,7 +83,7 @@ class Lookahead(MapPlanner):
         streams = self.candidates * self.samples * 2 ** (self.rounds - 1)
         check_bytes(
             f"planner.candidates={self.candidates}, planner.samples={self.samples}, planner.rounds={self.rounds}",
-            len(state.surface) * streams * (16 * self.cell.num_choices + cell.handling * 10 * cell.room**2),
+            len(state.surface) * streams * (16 * self.cell.num_choices + 10 * cell.record_bytes),
             state.surface.device,
         )
         logits = self.policy.footprint_logits(observation, self.policy.with_cell(cell).ranked(maps))

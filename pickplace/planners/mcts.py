@@ -103,8 +103,8 @@ class MCTS(MapPlanner):
     ):
         self.cell, self.items, self.mask = cell, search_items(items), flag("planner.mask", mask)
         self.simulations = whole_number("planner.simulations", simulations, most=MAX_NODES)
-        self.node_bytes = 1_000 + cell.handling * cell.room**2  # mostly the table of the items below one another
-        check_bytes(f"planner.simulations={simulations} with loads", self.simulations * cell.handling * self.node_bytes)
+        self.node_bytes = 1_000 + cell.record_bytes
+        check_bytes(f"planner.simulations={simulations}", self.simulations * bool(cell.record_bytes) * self.node_bytes)
         self.batch_simulations = whole_number("planner.batch_simulations", batch_simulations, most=4_096)
         self.exploration = number("planner.exploration", exploration, most=1e6)
         self.widening = number("planner.widening", widening, most=1)

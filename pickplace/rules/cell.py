@@ -186,6 +186,11 @@ class CellSpec:
         """``L``, the number of items that a tote has room for."""
         return self.most_items or self.tote_volume(self.tote_size[2])
 
+    @property
+    def record_bytes(self) -> int:
+        """About the bytes of what a state records of the items in a tote: what lies on what, and their boxes."""
+        return self.handling * self.room**2 + self.support.sees_boxes * 48 * self.room
+
     @cached_property
     def limits(self) -> Limits | None:
         """The limits of the robot on this cell's grids, see :class:`Limits`; None: no limits."""

@@ -34,7 +34,7 @@ class Step(NamedTuple):
     item: Item  # the item that is taken, [N]
     taken: Tensor  # int64 [N]: its number in the bin
     pile: Pile | None  # the items in the tote, see State
-    boxes: Tensor | None
+    boxes: Tensor | None  # in the totes, see State
 
 
 def apply(cell: CellSpec, state: State, action: Tensor) -> Step:

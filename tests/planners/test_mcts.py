@@ -187,5 +187,5 @@ def test_the_most_visited_action_is_played():
 
 def test_loads_that_would_fill_the_memory_are_refused():
     env = PickPlaceEnv(num_envs=1, tote_size=(8, 8, 8), handling=True)
-    with pytest.raises(ValueError, match=r"^planner.simulations=5000 with loads: it would take 1\.\d+ GB"):
+    with pytest.raises(ValueError, match=r"^planner.simulations=5000: it would take 1\.\d+ GB"):
         MCTS(env.cell, env.items)

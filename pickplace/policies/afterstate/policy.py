@@ -64,7 +64,7 @@ class Afterstate(FootprintPolicy):
         return after, item.volume, value
 
     def scores(self, observation: Observation, row: Tensor, footprint: Tensor) -> Tensor:
-        state = State.from_observation(observation)._replace(pile=None)  # the networks do not see piles
+        state = State.from_observation(observation)._replace(pile=None, boxes=None)  # which the networks do not see
         before = state.rows(row)
         _, volume, value = self.evaluate_choices(before, footprint)
         less = before.items.volume.amax(1) - volume  # relative to the largest item: exactly 0 with one in the bin

@@ -17,6 +17,8 @@ from pickplace.rules.support.contact import Contact
 SHRINK = 0.1  # share of the way to the mean of its corners by which a hull is made smaller
 SKEW = 1e-6  # shift along x for each cell along y: then a line along y has a slope
 
+MAX_VISITS = 2_000  # of boxes in one test: the number of paths grows exponentially in a pile of crossed planks
+
 Point: TypeAlias = tuple[float, float]
 Cuboid: TypeAlias = tuple[int, ...]  # x, y, z, w, d, h
 
@@ -30,8 +32,7 @@ class Pct(Support):
     that it touches: all of it to the one below its centre, else in shares by the places of the contacts. That code
     tests a placement twice, and both must agree: down each path to the floor by itself, and with all paths together.
 
-    Placements are tested one by one, in Python. A measured surface shows no boxes; there everything under the item must
-    carry it.
+    Placements are tested one by one, in Python. An item with thousands of paths down to the floor counts as unstable.
     """
 
     sees_boxes = True
@@ -96,28 +97,15 @@ class _Box:
         # Least squares may give a negative share. With no mass left there is no centre, and nothing carries it.
         return _Load(x / mass, y / mass, mass) if mass else _Load(nan, nan, mass)
 
-    def bears_each_path(self, load: _Load) -> bool:
-        """Return whether the load can be carried down every path to the floor, each by itself."""
+    def hand_down(self, load: _Load) -> list[_Load] | None:
+        """Return what each contact carries of a load; None if its centre is outside the hull."""
         if not self.contacts:
-            return True
-        if not _is_inside((load.x, load.y), self.hull):
-            return False
-        pairs = zip(self.contacts, _shares(load, self.contacts), strict=True)
-        return all(below.box.bears_each_path(below.box.weigh(self, share)) for below, share in pairs)
+            return []
+        return _shares(load, self.contacts) if _is_inside((load.x, load.y), self.hull) else None
 
-    def settle(self, changes: list) -> bool:
-        """Hand the load down, and return whether everything below can carry it. ``changes`` gets what was before."""
-        if not self.contacts:
-            return True
-        if not _is_inside((self.total.x, self.total.y), self.hull):
-            return False
-        for (box, *_), share in zip(self.contacts, _shares(self.total, self.contacts), strict=True):
-            changes.append((box, box.received, (box.total.x, box.total.y, box.total.mass)))
-            box.received = {**box.received, self: share}
-            # In place: an item that carries all of the box refers to this load.
-            after = box.weigh()
-            box.total.x, box.total.y, box.total.mass = after.x, after.y, after.mass
-        return all(below.box.settle(changes) for below in self.contacts)
+
+#: An item, what it had received, and its load, before a change.
+_Change: TypeAlias = tuple[_Box, dict[_Box, _Load], tuple[float, float, float]]
 
 
 class _Pile:
@@ -127,7 +115,7 @@ class _Pile:
         self.by_top: dict[int, list[_Box]] = {}
         for cuboid in cuboids:
             box = _Box(cuboid, self.by_top.get(cuboid[2], []))
-            box.settle([])
+            _settle(box, [])
             self.by_top.setdefault(box.top, []).append(box)
 
     def bears(self, cuboid: Cuboid) -> bool:
@@ -135,13 +123,46 @@ class _Pile:
         if cuboid[2] not in self.by_top:
             return False  # outside the tote
         box = _Box(cuboid, self.by_top[cuboid[2]])
-        if not box.contacts or not box.bears_each_path(box.total):
+        if not box.contacts or not _is_carried_by_each_path(box):
             return False
-        changes: list[tuple[_Box, dict[_Box, _Load], tuple[float, float, float]]] = []
-        good = box.settle(changes)
-        for below, received, total in reversed(changes):
-            below.received, (below.total.x, below.total.y, below.total.mass) = received, total
-        return good
+        changes: list[_Change] = []
+        try:
+            return _settle(box, changes)
+        finally:
+            for below, received, total in reversed(changes):
+                below.received, (below.total.x, below.total.y, below.total.mass) = received, total
+
+
+def _is_carried_by_each_path(box: _Box) -> bool:
+    """Return whether the load of a new item can be carried down every path to the floor, each by itself."""
+    open_ = [(box, box.total)]
+    for _ in range(MAX_VISITS):
+        if not open_:
+            return True
+        box, load = open_.pop()
+        if (shares := box.hand_down(load)) is None:
+            return False
+        open_ += [(below.box, below.box.weigh(box, share)) for below, share in zip(box.contacts, shares, strict=True)]
+    return False
+
+
+def _settle(box: _Box, changes: list[_Change]) -> bool:
+    """Hand the load of a new item down, and return whether everything carries it; ``changes`` gets what was before."""
+    open_ = [box]
+    for _ in range(MAX_VISITS):
+        if not open_:
+            return True
+        box = open_.pop()
+        if (shares := box.hand_down(box.total)) is None:
+            return False
+        for (below, *_), share in zip(box.contacts, shares, strict=True):
+            changes.append((below, below.received, (below.total.x, below.total.y, below.total.mass)))
+            below.received = {**below.received, box: share}
+            # In place: an item that carries all of the box refers to this load.
+            after = below.weigh()
+            below.total.x, below.total.y, below.total.mass = after.x, after.y, after.mass
+        open_ += [below.box for below in reversed(box.contacts)]
+    return False
 
 
 def _pile(boxes: Tensor) -> _Pile:
