@@ -96,6 +96,8 @@ def check_command(command, search, words, is_new):
     with config_files():
         _, cfg = compose_job(command, [*search, *words])
     if command == "train" and is_new:
+        if (own := cfg["items"].get("path")) and not (ROOT / own).is_file():  # a reader's file
+            cfg["items"]["path"] = str(DOCS / "examples" / "orders" / "orders.csv")
         items, curriculum = build("items", cfg["items"]), build("curriculum", cfg.curriculum)
         curriculum.setup(build_cell(OmegaConf.to_container(cfg.env, resolve=True)), items, cfg.total_frames)
         assert curriculum.check_budget(cfg.total_frames, 2048) is None, words
