@@ -450,6 +450,7 @@ def test_overrides_on_a_saved_config():
     assert saved.algo.gamma == 0.99
     other = composed("items=tall")["items"]
     swapped = apply_overrides(saved, ["items=tall", "items.height=[1,2]"], {"items": other})
+    assert swapped == apply_overrides(saved, ["items.height=[1,2]", "items=tall"], {"items": other})
     assert swapped["items"].height == [1, 2]
 
 
