@@ -43,13 +43,19 @@ def export(source, folder: Path, evaluations: list[Path]) -> None:
             raise ValueError(f"{path}: expected an evaluation.json of a trained policy ({error}).") from error
         if found != trained:
             raise ValueError(f"{path}: it evaluates a policy of {found}, expected {trained}.")
-        results.append({**result, "checkpoint": f"pretrained/{folder.name}"})
+        results.append({**result, "items": without_folder(result["items"]), "checkpoint": f"pretrained/{folder.name}"})
+    facts["config"]["items"] = without_folder(facts["config"]["items"])
     networks = ("policy", "critic") if critic_serves_any_tote(trusted_config(facts["config"])) else ("policy",)
     kept = {key: facts[key] for key in ("frames", "config", "versions", "commit")}
     checkpoint.write(folder, {key: state[key] for key in networks}, kept)
     card = {"name": f"pretrained/{folder.name}", "trained": trained, "versions": facts["versions"]}
     card |= {"config": facts["config"], "evaluations": results}
     (folder / CARD).write_text(json.dumps(card, indent=1) + "\n")
+
+
+def without_folder(items: dict) -> dict:
+    """Return the config of items; if these are of a file, with its name alone: each user has an own copy."""
+    return items | ({"path": Path(items["path"]).name} if items.get("path") else {})
 
 
 def critic_serves_any_tote(cfg: DictConfig) -> bool:
