@@ -54,7 +54,7 @@ def export(source, folder: Path, evaluations: list[Path]) -> None:
 
 
 def without_folder(items: dict) -> dict:
-    """Return the config of items; if these are of a file, with its name alone: each user has an own copy."""
+    """Return the config of items; if these are of a file, with its name alone: each user has their own copy."""
     return items | ({"path": Path(items["path"]).name} if items.get("path") else {})
 
 

@@ -106,11 +106,13 @@ def _are_possible(boxes: Tensor, steps: Tensor, heights: Tensor) -> Tensor:
     x, y, z, w, d, h = boxes.unbind(2)
     good = ((boxes[..., 3:] > 0).all(2) == there) & (boxes >= 0).all(2) & (there | (boxes == 0).all(2))
     good &= (x + w <= heights.shape[1]) & (y + d <= heights.shape[2])
-    tops = torch.zeros_like(heights)
-    for box in range(int(steps.max())):  # one at a time, for the memory
+    possible = good.all(1) & (steps <= boxes.shape[1])
+    tops = torch.zeros_like(heights, dtype=torch.int64)
+    for box in range(min(int(steps.max()), boxes.shape[1])):  # put down one after the other
         covered = rectangle(heights.shape[1:], *(part[:, box] for part in (x, y, w, d))).permute(2, 0, 1)
-        tops = torch.maximum(tops, covered * (z + h)[:, box, None, None].to(tops.dtype))
-    return good.all(1) & (tops == heights).flatten(1).all(1)
+        possible &= (tops * covered).flatten(1).amax(1) == z[:, box]
+        tops = torch.where(covered, (z + h)[:, box, None, None], tops)
+    return possible & (tops == heights).flatten(1).all(1)
 
 
 def _is_possible(pile: Pile, steps: Tensor, heights: Tensor) -> Tensor:
