@@ -208,7 +208,7 @@ def test_a_state_without_a_pile(env):
         lambda boxes: boxes[0, 0, 0].fill_(-1),
         lambda boxes: boxes[0, 0, 4].fill_(6),  # leaves the tote
         lambda boxes: boxes[0, -1].fill_(1),
-        lambda boxes: boxes[0, 1, 2].sub_(1),  # lies in the one below it
+        lambda boxes: boxes[:, 1].sub_(torch.tensor([0, 0, 1, 0, 0, -1])),  # in the one below, as high as before
         lambda boxes: boxes.zero_(),
     ],
 )
