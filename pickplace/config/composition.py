@@ -220,7 +220,7 @@ def apply_overrides(saved: DictConfig, overrides: list[str], groups: Any = None,
     """
     cfg = saved.copy()
     OmegaConf.set_struct(cfg, True)
-    # As for Hydra, a value counts on top of a group's option, whichever is written first.
+    # As in Hydra, a value overrides that of a group's option, whichever is written first.
     for override in sorted(parse(overrides), key=lambda override: override.key_or_group not in (groups or ())):
         key, line = override.key_or_group, override.input_line
         is_part = key.startswith("env.") and bool(names_at(key))  # a part of the cell, in its short or its long form

@@ -18,7 +18,7 @@ from pickplace.rules.support.hull import COVERED, PATTERN_SIDE, exact_dtype, hul
 
 
 class Neighbours(NamedTuple):
-    """What else is in the tote, and where the item is among it; for rules with ``sees_boxes``."""
+    """The boxes in the tote, and where the item comes to rest; for rules with ``sees_boxes``."""
 
     boxes: Tensor  # int64 [N, L, 6]: x, y, z, w, d, h of the items in the tote, in their order, then zeros
     x: Tensor  # minimum corner of the footprint, broadcastable to the shape of ``Contact.z``, whose last axis is N
@@ -35,7 +35,7 @@ class Contact:
         under: whether the item covers these cells, bool, broadcastable.
         z: the height on which the item rests, int32.
         w, d: the footprint's sides, broadcastable; 0 for no item.
-        recorded: what else is in the tote, for rules with ``sees_boxes``; None: it is not known.
+        recorded: the boxes in the tote, for rules with ``sees_boxes``; None: they are not known.
 
     Attributes:
         supporting: the surface of a supporting cell, int32 of the shape of ``z``.
@@ -50,7 +50,7 @@ class Contact:
 
     @property
     def neighbours(self) -> Neighbours:
-        """What else is in the tote; raise ``ValueError`` if it is not known."""
+        """The boxes in the tote; raise ``ValueError`` if they are not known."""
         if self.recorded is None:
             raise ValueError("The state has no boxes, but the stability rule looks at them: expected State.boxes.")
         return self.recorded

@@ -14,7 +14,7 @@ from pickplace.common.validate import refuse_if
 from pickplace.rules.support.base import Support
 from pickplace.rules.support.contact import Contact
 
-SHRINK = 0.1  # share of the way to the mean of its corners by which a hull is made smaller
+SHRINK = 0.1  # the corners of a hull move by this share of the way to their mean
 SKEW = 1e-6  # shift along x for each cell along y: then a line along y has a slope
 
 MAX_VISITS = 2_000  # of boxes in one test: the number of paths grows exponentially in a pile of crossed planks
@@ -25,7 +25,7 @@ Cuboid: TypeAlias = tuple[int, ...]  # x, y, z, w, d, h
 
 @dataclass(frozen=True)
 class Pct(Support):
-    """The load of the item, and of each item below it, stays inside the hull of what carries it.
+    """For the item and each item below, the centre of the load is inside the hull of the areas that carry it.
 
     From the code of PCT (Zhao et al., 2022, "Learning Efficient Online 3D Bin Packing on Packing Configuration Trees"),
     setting 1. Items weigh as much as their volume. Hulls are made smaller by a tenth. An item hands its load to those
@@ -59,7 +59,7 @@ class _Load:
 
 
 class _Contact(NamedTuple):
-    """Where an item lies on another one."""
+    """The area in which an item lies on one below."""
 
     box: "_Box"
     near: tuple[int, int]  # least x and y
